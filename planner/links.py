@@ -18,20 +18,6 @@ DIRECTIONS: tuple[Block, ...] = tuple(
     direction for direction in itertools.product((-1, 0, 1), repeat=3) if direction != (0, 0, 0)
 )
 LINK_COUNT = len(DIRECTIONS)
-MAX_SIDE_BLOCKS = 6
-
-
-class Links(NamedTuple):
-    """The grid's links, the same for every aircraft. Offsets are in flat block indices.
-
-    `step` (26, 3) directions; `offset` (26,) to the neighbour; `side_offset` (26, 6) and `side_count` (26,)
-    the blocks of the box spanned by a block and its neighbour, without these two.
-    """
-
-    step: IntArray
-    offset: IntArray
-    side_offset: IntArray
-    side_count: IntArray
 
 
 class LinkTimes(NamedTuple):
@@ -45,27 +31,10 @@ class LinkTimes(NamedTuple):
     beta: int
 
 
-def build_links(grid: AirMatrix) -> Links:
-    """Return the link offsets of a grid."""
+def build_offsets(grid: AirMatrix) -> IntArray:
+    """Return the 26 links' offsets in flat block indices."""
     count_i, count_j, _ = grid.dimensions
-
-    def flat(step: Block) -> int:
-        i, j, k = step
-        return (k * count_j + j) * count_i + i
-
-    side_offset = np.zeros((LINK_COUNT, MAX_SIDE_BLOCKS), dtype=np.int64)
-    side_count = np.zeros(LINK_COUNT, dtype=np.int64)
-    for link, direction in enumerate(DIRECTIONS):
-        for corner in box_steps(direction):
-            if corner not in ((0, 0, 0), direction):
-                side_offset[link, side_count[link]] = flat(corner)
-                side_count[link] += 1
-    return Links(
-        step=np.array(DIRECTIONS, dtype=np.int64),
-        offset=np.array([flat(direction) for direction in DIRECTIONS], dtype=np.int64),
-        side_offset=side_offset,
-        side_count=side_count,
-    )
+    return np.array([(k * count_j + j) * count_i + i for i, j, k in DIRECTIONS], dtype=np.int64)
 
 
 def box_steps(direction: Block) -> list[Block]:

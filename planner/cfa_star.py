@@ -1,0 +1,214 @@
+"""Plan one flight: request -> arrays -> kernel -> `Plan` or a typed error (paper 3)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from planner.aircraft import AircraftType
+from planner.airmatrix import AirMatrix
+from planner.airspace import Airspace
+from planner.errors import (
+    DestinationBlocked,
+    Disconnected,
+    EnduranceExceeded,
+    NoConflictFreePath,
+    NoDepartureSlot,
+    NoPlan,
+    OriginBlocked,
+    SameBlock,
+)
+from planner.kernels import path as path_kernels
+from planner.kernels import search as search_kernels
+from planner.kernels.connectivity import label_components
+from planner.kernels.heap import G as LABEL_G
+from planner.kernels.intervals import Slabs, empty_slabs
+from planner.kernels.search import Motion, Task
+from planner.links import LinkTimes, build_link_times, build_offsets
+from planner.occupancy import OccupancyIndex, build_motion, open_links
+from planner.path import Plan
+
+# How far beyond the requested window a refusal looks for a departure that would work; within what keys can order.
+_OUTLOOK_MS = 1 << 31
+_INITIAL_LABELS = 1 << 14
+
+
+class Search(StrEnum):
+    """The two kinds of CFA*: the paper's, and the one that misses no path."""
+
+    GREEDY = "greedy"
+    SAFE_INTERVAL = "safe-interval"
+
+
+@dataclass(frozen=True, eq=False)
+class Performance:
+    """What the search needs of an aircraft. `endurance_ms` bounds arrival minus departure, None for no bound."""
+
+    times: LinkTimes
+    endurance_ms: int | None = None
+
+    @classmethod
+    def of(cls, aircraft: AircraftType, grid: AirMatrix) -> "Performance":
+        """Return an aircraft's performance in a grid; raises `AircraftProfileError`."""
+        endurance = None if aircraft.endurance_s is None else int(aircraft.endurance_s * 1000)
+        return cls(build_link_times(aircraft, grid), endurance)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanRequest:
+    """From block to block (flat indices) with a departure in [earliest, latest], in ms."""
+
+    origin: int
+    destination: int
+    performance: Performance
+    earliest_departure_ms: int
+    latest_departure_ms: int
+
+    def __post_init__(self) -> None:
+        if self.latest_departure_ms < self.earliest_departure_ms:
+            raise ValueError("latest_departure_ms lies before earliest_departure_ms")
+
+
+class Planner:
+    """CFA* over one airspace and the reservations in `index`. One thread at a time."""
+
+    def __init__(self, airspace: Airspace, search: Search = Search.SAFE_INTERVAL, hover_limit_ms: int = 60_000) -> None:
+        self.airspace = airspace
+        self.search = search
+        self.hover_limit_ms = hover_limit_ms
+        self.index = OccupancyIndex(airspace.grid.block_count)
+        self._open_links = open_links(airspace)
+        self._components = label_components(self._open_links, build_offsets(airspace.grid))
+        self._empty = empty_slabs(airspace.grid.block_count, pool_size=1)
+        self._workspace = search_kernels.new_workspace(airspace.grid.block_count, _INITIAL_LABELS)
+        self._stamp = 0
+        self._motions: dict[tuple[int, ...], Motion] = {}
+
+    def plan(self, request: PlanRequest) -> Plan:
+        """Return a conflict-free plan; with the safe-interval search the one of earliest arrival.
+
+        Raises
+        ------
+        NotPlannable
+            No traffic could make it possible (paper 2.1: a block outside, blocked, or cut off).
+        NoPlan
+            The present reservations leave no plan.
+        """
+        self.check(request.origin, request.destination)
+        motion = self._motion(request.performance)
+        task = Task(
+            request.origin,
+            request.destination,
+            request.earliest_departure_ms,
+            request.latest_departure_ms,
+            self.airspace.terminal_dwell_ms,
+            self.hover_limit_ms,
+            stamp=0,
+        )
+        found = self._search(request, motion, task)
+        if isinstance(found, Plan):
+            return found
+        later = self._search(request, motion, task._replace(latest=task.latest + _OUTLOOK_MS))
+        raise self._refusal(found, task, later.departure_ms if isinstance(later, Plan) else None)
+
+    def unconstrained(self, request: PlanRequest) -> int:
+        """Return the flight time without traffic in ms, dwell included: A* under the airspace's rule."""
+        self.check(request.origin, request.destination)
+        task = Task(request.origin, request.destination, 0, 0, self.airspace.terminal_dwell_ms, 0, stamp=0)
+        return self._unconstrained(self._motion(request.performance), task)
+
+    def check(self, origin: int, destination: int) -> None:
+        """Raise the `NotPlannable` that applies to these blocks, if any."""
+        occupied = self.airspace.occupied
+        if occupied[origin]:
+            raise OriginBlocked(f"the origin's block {self.airspace.grid.block(origin)} is occupied by a building")
+        if occupied[destination]:
+            raise DestinationBlocked(
+                f"the destination's block {self.airspace.grid.block(destination)} is occupied by a building"
+            )
+        if origin == destination:
+            raise SameBlock(f"origin and destination lie in one block, {self.airspace.grid.block(origin)}")
+        if self._components[origin] != self._components[destination]:
+            raise Disconnected("buildings leave no way from the origin's block to the destination's")
+
+    def _search(self, request: PlanRequest, motion: Motion, task: Task) -> Plan | type[NoPlan]:
+        """Search and return the plan, or why there is none."""
+        kernel = search_kernels.greedy if self.search is Search.GREEDY else search_kernels.safe_interval
+        status, goal, expansions, disturbed = self._run(kernel, motion, self.index.slabs, task)
+        if status != search_kernels.FOUND:
+            return NoDepartureSlot if status == search_kernels.NO_DEPARTURE_SLOT else NoConflictFreePath
+        plan = self._plan(motion, task, goal, expansions, disturbed)
+        endurance = request.performance.endurance_ms
+        if endurance is None or plan.flight_time_ms <= endurance:
+            return plan
+        if self.search is Search.GREEDY:
+            return EnduranceExceeded
+        status, goal, further, _ = self._run(search_kernels.within_endurance, motion, self.index.slabs, task, endurance)
+        if status != search_kernels.FOUND:
+            return EnduranceExceeded
+        return self._plan(motion, task, goal, expansions + further, disturbed=True)
+
+    def _run(
+        self,
+        kernel: Callable[..., tuple[int, int, int, bool]],
+        motion: Motion,
+        slabs: Slabs,
+        task: Task,
+        *rest: int,
+    ) -> tuple[int, int, int, bool]:
+        """Run a search kernel, with a larger workspace as often as it asks for one."""
+        while True:
+            stamped = task._replace(stamp=self._next_stamp())
+            outcome = kernel(self._open_links, motion, slabs, self._workspace, stamped, *rest)
+            if outcome[0] != search_kernels.WORKSPACE_FULL:
+                return outcome
+            self._workspace = search_kernels.new_workspace(len(self._components), 2 * len(self._workspace.labels))
+
+    def _next_stamp(self) -> int:
+        self._stamp += 1
+        return self._stamp
+
+    def _plan(self, motion: Motion, task: Task, goal: int, expansions: int, disturbed: bool) -> Plan:
+        """Turn the labels of a finished search into a plan."""
+        ws = self._workspace
+        block, arrive, depart, gap_end = path_kernels.trace(ws.labels, goal, task)
+        if self.search is Search.SAFE_INTERVAL:
+            path_kernels.wait_early(motion, self.index.slabs, block, arrive, depart, gap_end)
+        path_kernels.hold_on_ground(arrive, depart, task)
+        hold_block, hold_enter, hold_exit = path_kernels.holds(
+            motion, ws.marks, self._next_stamp(), block, arrive, depart
+        )
+        undisturbed_ms = int(depart[-1]) - task.earliest
+        return Plan(
+            block=block,
+            arrive_ms=arrive,
+            depart_ms=depart,
+            hold_block=hold_block,
+            hold_enter_ms=hold_enter,
+            hold_exit_ms=hold_exit,
+            earliest_departure_ms=task.earliest,
+            unconstrained_ms=self._unconstrained(motion, task) if disturbed else undisturbed_ms,
+            terminal_dwell_ms=task.dwell,
+            expansions=expansions,
+        )
+
+    def _unconstrained(self, motion: Motion, task: Task) -> int:
+        _, goal, _, _ = self._run(search_kernels.greedy, motion, self._empty, task)
+        return int(self._workspace.labels[goal, LABEL_G]) + task.dwell - task.earliest
+
+    def _motion(self, performance: Performance) -> Motion:
+        key = performance.times[1:]
+        if key not in self._motions:
+            self._motions[key] = build_motion(performance.times, self.airspace)
+        return self._motions[key]
+
+    def _refusal(self, reason: type[NoPlan], task: Task, feasible_departure_ms: int | None) -> NoPlan:
+        """Return the error for a request without plan, with what its operator can do about it."""
+        owners: tuple[int, ...] = ()
+        if reason is NoDepartureSlot:
+            message = "the first block is reserved throughout the departure window"
+            owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
+        elif reason is NoConflictFreePath:
+            message = "no conflict-free path leads from the first block within the departure window"
+        else:
+            message = "every conflict-free plan takes longer than the aircraft's endurance"
+        return reason(message, owners, feasible_departure_ms)

@@ -1,0 +1,188 @@
+"""Committed reservations, sorted per block in contiguous slabs of one pool.
+
+A slab holds ``4 << size_class`` reservations. A block whose slab is full moves to one of the next class; freed slabs
+are chained through the first slot's enter. Free intervals ("gaps") are the spaces between
+reservations: gap g of a block lies before reservation g, so a block with c reservations has gaps 0 … c.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from planner.airmatrix import IntArray
+from planner.kernels.policy import kernel
+
+FAR_FUTURE = 1 << 62
+
+SMALLEST_SLAB = 4
+SIZE_CLASSES = 40
+
+
+# Columns of `table` (a row a block), and of `pool` (a row a reservation).
+FIRST, COUNT, SIZE_CLASS = range(3)
+ENTER, EXIT, OWNER = range(3)
+
+
+class Slabs(NamedTuple):
+    """`table` (blocks, 3): first slot, count, size class. `pool` (slots, 3): enter, exit, owner.
+
+    `chains` (SIZE_CLASSES + 1,): heads of the chains of freed slabs, -1 for none; last, how many slots were ever
+    handed out. Kernels get the arrays one by one: numba counts references each time it takes one out of a tuple.
+    """
+
+    table: IntArray
+    pool: IntArray
+    chains: IntArray
+
+
+def empty_slabs(block_count: int, pool_size: int) -> Slabs:
+    """Return an index of `block_count` blocks without reservations."""
+    chains = np.full(SIZE_CLASSES + 1, -1, dtype=np.int64)
+    chains[-1] = 0
+    table = np.zeros((block_count, 3), dtype=np.int64)
+    table[:, FIRST] = -1
+    return Slabs(table, np.empty((pool_size, 3), dtype=np.int64), chains)
+
+
+@kernel
+def ended_by(table: IntArray, pool: IntArray, block: int, time: int) -> int:
+    """Return how many of a block's reservations have ended by `time`: the gap or reservation that holds it."""
+    start = table[block, FIRST]
+    low, high = start, start + table[block, COUNT]
+    while low < high:
+        middle = (low + high) >> 1
+        if pool[middle, EXIT] <= time:
+            low = middle + 1
+        else:
+            high = middle
+    return low - start
+
+
+@kernel
+def take_slab(pool: IntArray, chains: IntArray, size_class: int) -> int:
+    """Return the first slot of an unused slab, -1 if the pool is exhausted."""
+    slot = chains[size_class]
+    if slot >= 0:
+        chains[size_class] = pool[slot, ENTER]
+        return slot
+    slot = chains[SIZE_CLASSES]
+    end = slot + (SMALLEST_SLAB << size_class)
+    if end > pool.shape[0]:
+        return -1
+    chains[SIZE_CLASSES] = end
+    return slot
+
+
+@kernel
+def give_slab_back(pool: IntArray, chains: IntArray, slot: int, size_class: int) -> None:
+    """Chain a slab into the free list of its class."""
+    pool[slot, ENTER] = chains[size_class]
+    chains[size_class] = slot
+
+
+@kernel
+def move(pool: IntArray, source: int, target: int) -> None:
+    """Copy a reservation from one slot to another."""
+    pool[target, ENTER] = pool[source, ENTER]
+    pool[target, EXIT] = pool[source, EXIT]
+    pool[target, OWNER] = pool[source, OWNER]
+
+
+@kernel
+def make_room(table: IntArray, pool: IntArray, chains: IntArray, block: int) -> bool:
+    """Make room for one more reservation in the block's slab; False if the pool is exhausted."""
+    first, count, size_class = table[block, FIRST], table[block, COUNT], table[block, SIZE_CLASS]
+    if first >= 0 and count < SMALLEST_SLAB << size_class:
+        return True
+    larger = size_class + 1 if first >= 0 else 0
+    slot = take_slab(pool, chains, larger)
+    if slot < 0:
+        return False
+    if first >= 0:
+        for g in range(count):
+            move(pool, first + g, slot + g)
+        give_slab_back(pool, chains, first, size_class)
+    table[block, FIRST] = slot
+    table[block, SIZE_CLASS] = larger
+    return True
+
+
+@kernel
+def first_overlap(table: IntArray, pool: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray) -> int:
+    """Return the position of the first given interval that overlaps a reservation, -1 if none does."""
+    for n in range(blocks.shape[0]):
+        block = blocks[n]
+        g = ended_by(table, pool, block, enters[n])
+        if g < table[block, COUNT] and pool[table[block, FIRST] + g, ENTER] < exits[n]:
+            return n
+    return -1
+
+
+@kernel
+def insert(
+    table: IntArray,
+    pool: IntArray,
+    chains: IntArray,
+    blocks: IntArray,
+    enters: IntArray,
+    exits: IntArray,
+    owner: int,
+    start: int,
+) -> int:
+    """Insert disjoint intervals from position `start` on; return where it stopped for want of pool slots."""
+    for n in range(start, blocks.shape[0]):
+        block = blocks[n]
+        if not make_room(table, pool, chains, block):
+            return n
+        first, count = table[block, FIRST], table[block, COUNT]
+        slot = first + ended_by(table, pool, block, enters[n])
+        for later in range(first + count, slot, -1):
+            move(pool, later - 1, later)
+        pool[slot, ENTER] = enters[n]
+        pool[slot, EXIT] = exits[n]
+        pool[slot, OWNER] = owner
+        table[block, COUNT] = count + 1
+    return blocks.shape[0]
+
+
+@kernel
+def drop_range(table: IntArray, pool: IntArray, chains: IntArray, block: int, start: int, stop: int) -> None:
+    """Drop a block's reservations start … stop - 1; an empty block gives its slab back."""
+    first, count = table[block, FIRST], table[block, COUNT]
+    gone = stop - start
+    for slot in range(first + start, first + count - gone):
+        move(pool, slot + gone, slot)
+    table[block, COUNT] = count - gone
+    if count == gone:
+        give_slab_back(pool, chains, first, table[block, SIZE_CLASS])
+        table[block, FIRST] = -1
+        table[block, SIZE_CLASS] = 0
+
+
+@kernel
+def remove(
+    table: IntArray, pool: IntArray, chains: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray
+) -> int:
+    """Remove the given intervals where they are present exactly; return how many were."""
+    removed = 0
+    for n in range(blocks.shape[0]):
+        block = blocks[n]
+        g = ended_by(table, pool, block, enters[n])
+        slot = table[block, FIRST] + g
+        if g < table[block, COUNT] and pool[slot, ENTER] == enters[n] and pool[slot, EXIT] == exits[n]:
+            drop_range(table, pool, chains, block, g, g + 1)
+            removed += 1
+    return removed
+
+
+@kernel
+def forget(table: IntArray, pool: IntArray, chains: IntArray, time: int) -> int:
+    """Drop every reservation that has ended by `time`; return how many."""
+    dropped = 0
+    for block in range(table.shape[0]):
+        if table[block, COUNT] > 0:
+            ended = ended_by(table, pool, block, time)
+            if ended > 0:
+                drop_range(table, pool, chains, block, 0, ended)
+                dropped += ended
+    return dropped

@@ -1,0 +1,51 @@
+"""The one way kernels are compiled.
+
+numba's cache notices a change of the file a kernel stands in, but neither of its callees' files nor of the
+bounds-check flag, and then runs stale machine code. So each state of the sources has a cache folder of its own.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+Kernel = TypeVar("Kernel", bound=Callable[..., object])
+
+_config = cast(Any, numba).config
+
+
+def cache_folder() -> Path:
+    """Return the folder for machine code compiled from these very sources with this numba and these flags."""
+    here = Path(__file__).parent
+    digest = hashlib.sha256(f"{numba.__version__} boundscheck={_config.BOUNDSCHECK}".encode())
+    for source in sorted(here.glob("*.py")):
+        digest.update(source.read_bytes())
+    if _config.CACHE_DIR:
+        root = Path(_config.CACHE_DIR)
+    elif os.access(here, os.W_OK):
+        root = here / "__pycache__"
+    else:
+        root = Path(tempfile.gettempdir()) / f"airmatrix-kernels-{os.getuid()}"
+    return root / digest.hexdigest()[:16]
+
+
+_CACHE_FOLDER = cache_folder()
+
+
+def is_compiled() -> bool:
+    """Tell whether machine code of the present sources is in the cache."""
+    return any(_CACHE_FOLDER.rglob("*.nbc"))
+
+
+def kernel(function: Kernel) -> Kernel:
+    """Compile without fastmath, without the GIL, cached. Kernels never divide by zero, so errors follow numpy."""
+    before = _config.CACHE_DIR
+    _config.CACHE_DIR = str(_CACHE_FOLDER)
+    try:
+        return cast(Kernel, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    finally:
+        _config.CACHE_DIR = before
