@@ -1,0 +1,1 @@
+"""The deconfliction service: everything with I/O around the planner."""

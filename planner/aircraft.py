@@ -15,6 +15,8 @@ from typing import Any
 from planner.errors import AircraftProfileError
 
 GRAVITY_MPS2 = 9.81  # as the paper uses it: its Inspire 2 has m·g·vv = 202.479 W
+# Far outside any multirotor, and near enough that the model's cubes neither overflow nor vanish.
+_SMALLEST, _LARGEST = 0.001, 1_000_000.0
 LINK_KINDS = ("horizontal", "vertical", "alpha", "beta")
 
 
@@ -54,12 +56,17 @@ class AircraftType:
             **{f"link_speeds_mps.{kind}": speed for kind, speed in self.link_speed_overrides.items()},
         }
         for name, value in numbers.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
-                raise AircraftProfileError(f"aircraft {self.id!r}: {name} must be a positive number, not {value!r}")
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not is_number or not _SMALLEST <= value <= _LARGEST:
+                raise AircraftProfileError(
+                    f"aircraft {self.id!r}: {name} must be a number from {_SMALLEST} to {_LARGEST:.0f}, not {value!r}"
+                )
         if self.speed_factor > 1:
             raise AircraftProfileError(f"aircraft {self.id!r}: speed_factor must be at most 1")
         if unknown := set(self.link_speed_overrides) - set(LINK_KINDS):
-            raise AircraftProfileError(f"aircraft {self.id!r}: unknown link speeds {sorted(unknown)}; known: {LINK_KINDS}")
+            raise AircraftProfileError(
+                f"aircraft {self.id!r}: unknown link speeds {sorted(unknown)}; known: {LINK_KINDS}"
+            )
         if self.max_vertical_speed_mps >= self.max_horizontal_speed_mps:
             raise AircraftProfileError(
                 f"aircraft {self.id!r}: the speed model needs max_horizontal_speed_mps > max_vertical_speed_mps"

@@ -4,6 +4,7 @@ Blocks are addressed as ``(i, j, k)``, zero-based, i east, j north, k up, or by 
 ``n = (k * J + j) * I + i``. Kernels, the ledger and files use the flat index.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +20,9 @@ FloatArray = npt.NDArray[np.float64]
 
 # Counts are floors of a quotient of metres; this keeps 2000 / 20 from being 99.
 _ROUNDING = 1e-9
+
+# 50 km x 50 km in three layers of 20 m blocks; searches keep some hundred bytes a block.
+MAX_BLOCKS = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,10 @@ class AirMatrix:
             raise AirspaceFileError(
                 f"an airspace needs at least one block in every direction, not {self.dimensions}; "
                 "check size, ceiling and block side and height"
+            )
+        if math.prod(self.dimensions) > MAX_BLOCKS:
+            raise AirspaceFileError(
+                f"an airspace can have {MAX_BLOCKS} blocks at most; take larger blocks or a smaller window"
             )
 
     @classmethod
@@ -65,9 +73,9 @@ class AirMatrix:
             block_side_m=block_side_m,
             block_height_m=block_height_m,
             dimensions=(
-                int(size_m[0] / block_side_m + _ROUNDING),
-                int(size_m[1] / block_side_m + _ROUNDING),
-                int(ceiling_m / block_height_m + _ROUNDING),
+                _whole(size_m[0] / block_side_m),
+                _whole(size_m[1] / block_side_m),
+                _whole(ceiling_m / block_height_m),
             ),
         )
 
@@ -105,7 +113,8 @@ class AirMatrix:
         """Return projected block centres in metres (x, y, height above ground): shape (n,) -> (n, 3)."""
         lengths = np.array([self.block_side_m, self.block_side_m, self.block_height_m])
         origin = np.array([self.origin_x_m, self.origin_y_m, 0.0])
-        return origin + (self.ijk(indices) + 0.5) * lengths
+        centres: FloatArray = origin + (self.ijk(indices) + 0.5) * lengths
+        return centres
 
     @cached_property
     def _to_projected(self) -> Transformer:
@@ -179,10 +188,3 @@ class AirMatrix:
         x = self.origin_x_m + np.arange(count_i + 1) * self.block_side_m
         y = self.origin_y_m + np.arange(count_j + 1) * self.block_side_m
         return self.unproject(*np.meshgrid(x, y))
-
-    @cached_property
-    def column_centres(self) -> tuple[FloatArray, FloatArray]:
-        """WGS84 degrees of all column centres (lon, lat), each of shape (J * I,), index j * I + i."""
-        count_i, count_j, _ = self.dimensions
-        columns = self.centres(np.arange(count_i * count_j, dtype=np.int64))
-        return self.unproject(columns[:, 0], columns[:, 1])

@@ -131,7 +131,11 @@ def building_feature(building: Building) -> dict[str, Any]:
     return {
         "type": "Feature",
         "id": building.id,
-        "properties": {"id": building.id, "height": building.height_m, "height_source": building.height_source},
+        "properties": {
+            "id": building.id,
+            "height": building.height_m,
+            "height_source": building.height_source,
+        },
         "geometry": building.footprint,
     }
 
@@ -146,18 +150,19 @@ def read_airspace(path: Path) -> Airspace:
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise AirspaceFileError(f"cannot read airspace file {path}: {error}") from error
     header = document.get("airmatrix") if isinstance(document, dict) else None
     if not isinstance(header, dict):
         raise AirspaceFileError(
-            f"{path} is not an airspace file; build one with: airmatrix airspace build --buildings FILE.geojson --out FILE"
+            f"{path} is not an airspace file; build one with: "
+            "airmatrix airspace build --buildings FILE.geojson --out FILE"
         )
     if header.get("format") != FORMAT:
         raise AirspaceFileError(f"{path}: format {header.get('format')!r}, expected {FORMAT!r}")
     try:
         airspace = _airspace(header, document["features"])
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
+    except (LookupError, TypeError, ValueError, OverflowError, zlib.error) as error:
         raise AirspaceFileError(f"{path} is damaged: {type(error).__name__}: {error}") from error
     if airspace.fingerprint != header.get("fingerprint"):
         raise AirspaceFileError(f"{path} is damaged: its content does not match its fingerprint")

@@ -15,7 +15,7 @@ from planner.errors import AircraftProfileError, Block
 
 # Order is part of determinism: where two links reach a block equally early, the earlier one wins.
 DIRECTIONS: tuple[Block, ...] = tuple(
-    direction for direction in itertools.product((-1, 0, 1), repeat=3) if direction != (0, 0, 0)
+    (i, j, k) for i, j, k in itertools.product((-1, 0, 1), repeat=3) if (i, j, k) != (0, 0, 0)
 )
 LINK_COUNT = len(DIRECTIONS)
 

@@ -26,8 +26,8 @@ class OccupancyIndex:
     def __len__(self) -> int:
         return int(self.slabs.table[:, intervals.COUNT].sum())
 
-    def reserve(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray, owner: int) -> None:
-        """Add half-open reservations [enter, exit), disjoint among themselves: all of them or none.
+    def reserve(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray, owner: int | IntArray) -> None:
+        """Add half-open reservations [enter, exit), disjoint among themselves, of one owner or one each: all or none.
 
         Raises
         ------
@@ -39,8 +39,9 @@ class OccupancyIndex:
         clash = intervals.first_overlap(self.slabs.table, self.slabs.pool, blocks, enters_ms, exits_ms)
         if clash >= 0:
             raise ValueError(f"block {blocks[clash]} is reserved within [{enters_ms[clash]}, {exits_ms[clash]})")
+        owners = np.broadcast_to(np.asarray(owner, dtype=np.int64), blocks.shape).copy()
         done = 0
-        while (done := intervals.insert(*self.slabs, blocks, enters_ms, exits_ms, owner, done)) < len(blocks):
+        while (done := intervals.insert(*self.slabs, blocks, enters_ms, exits_ms, owners, done)) < len(blocks):
             self._grow()
 
     def release(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray) -> int:
@@ -50,6 +51,10 @@ class OccupancyIndex:
     def forget_before(self, time_ms: int) -> int:
         """Drop the reservations that end by `time_ms`; return how many."""
         return int(intervals.forget(*self.slabs, time_ms))
+
+    def clear(self) -> None:
+        """Drop everything."""
+        self.slabs = intervals.empty_slabs(len(self.slabs.table), len(self.slabs.pool))
 
     def owners(self, block: int, from_ms: int, to_ms: int) -> tuple[int, ...]:
         """Return the owners of a block's reservations that overlap [from, to), in order of time, each once."""

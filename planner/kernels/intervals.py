@@ -126,7 +126,7 @@ def insert(
     blocks: IntArray,
     enters: IntArray,
     exits: IntArray,
-    owner: int,
+    owners: IntArray,
     start: int,
 ) -> int:
     """Insert disjoint intervals from position `start` on; return where it stopped for want of pool slots."""
@@ -140,7 +140,7 @@ def insert(
             move(pool, later - 1, later)
         pool[slot, ENTER] = enters[n]
         pool[slot, EXIT] = exits[n]
-        pool[slot, OWNER] = owner
+        pool[slot, OWNER] = owners[n]
         table[block, COUNT] = count + 1
     return blocks.shape[0]
 

@@ -1,4 +1,4 @@
-"""CFA* (paper 3.2): `greedy` as in its Algorithm 3 and `safe_interval`, beyond it; both are A* where nothing is reserved.
+"""CFA* (paper 3.2): `greedy` as its Algorithm 3, and `safe_interval` beyond it; both are A* where nothing is reserved.
 
 A label is an arrival at a block's centre: G its time, H the heuristic, F = G + H. Under either occupancy rule the
 hold of block p ends `tail` after the start s of a link and the hold of its neighbour n begins `lead` after s.

@@ -1,0 +1,108 @@
+"""What the service refuses, as two trees.
+
+RequestError                 answered as a problem; `app.problems` maps every one
+├── UnknownAircraftType      no profile of that id
+├── DepartureInThePast       the whole departure window has passed
+├── BeyondHorizon            departure later than plans are made
+├── PriorityNotSupported     priorities other than 0
+├── UnknownFlightIntent      no intent of that id
+├── UnknownBlock             no block of those indices
+├── IllegalTransition        the intent's state does not allow it
+├── IdempotencyKeyReused     the key came with another body before
+├── InvalidCursor            not a cursor of this list
+├── BodyTooLarge             more bytes than allowed
+├── MalformedRequest         not JSON, or not HTTP as it should be
+├── HostNotAllowed           a Host header that is not loopback, while there is no authentication
+├── QueueFull                more requests are waiting than allowed; nothing was taken
+└── LedgerUnavailable        the ledger failed; nothing was recorded
+StartupError                 the service or a command cannot start; the CLI prints it and exits with 2
+├── LedgerMissing            no ledger at that place
+├── ForeignLedger            a file that is no AirMatrix ledger
+├── LedgerOutdated           a ledger of another schema version
+├── AirspaceMismatch         a ledger of another airspace
+└── UnsafeListening          listening beyond loopback without authentication
+"""
+
+
+class RequestError(Exception):
+    """A request that is refused for a reason its sender can act on."""
+
+
+class UnknownAircraftType(RequestError):
+    """No aircraft profile has this id."""
+
+
+class DepartureInThePast(RequestError):
+    """The latest departure has passed."""
+
+
+class BeyondHorizon(RequestError):
+    """The departure lies further ahead than plans are made."""
+
+
+class PriorityNotSupported(RequestError):
+    """Only priority 0 exists."""
+
+
+class UnknownFlightIntent(RequestError):
+    """No flight intent has this id."""
+
+
+class UnknownBlock(RequestError):
+    """The airspace has no such block."""
+
+
+class IllegalTransition(RequestError):
+    """The flight intent's state does not allow this."""
+
+
+class IdempotencyKeyReused(RequestError):
+    """An Idempotency-Key came again with another body."""
+
+
+class InvalidCursor(RequestError):
+    """The cursor does not come from this list."""
+
+
+class BodyTooLarge(RequestError):
+    """The body has more bytes than allowed."""
+
+
+class MalformedRequest(RequestError):
+    """The request cannot be parsed."""
+
+
+class HostNotAllowed(RequestError):
+    """Without authentication only loopback Host headers are answered."""
+
+
+class QueueFull(RequestError):
+    """Too many requests are waiting for the writer; nothing was taken."""
+
+
+class LedgerUnavailable(RequestError):
+    """The ledger could not be written or read; nothing was recorded."""
+
+
+class StartupError(Exception):
+    """The service or a command cannot start."""
+
+
+class LedgerMissing(StartupError):
+    """There is no ledger at that place."""
+
+
+class ForeignLedger(StartupError):
+    """The file is not an AirMatrix ledger."""
+
+
+class LedgerOutdated(StartupError):
+    """The ledger's schema is of another version."""
+
+
+class AirspaceMismatch(StartupError):
+    """The ledger belongs to another airspace."""
+
+
+class UnsafeListening(StartupError):
+    """Without authentication the service listens on loopback only."""

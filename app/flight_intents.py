@@ -1,0 +1,121 @@
+"""Flight intents as the service thinks of them: between the HTTP bodies and the ledger's rows."""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from planner.airmatrix import IntArray
+from planner.path import Plan
+
+
+class State(StrEnum):
+    """States of a flight intent (ASTM F3548 names where it has them)."""
+
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+    CANCELLED = "cancelled"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True)
+class Position:
+    """WGS84 degrees, metres above the airspace's ground datum."""
+
+    lon: float
+    lat: float
+    alt_m: float
+
+
+@dataclass(frozen=True)
+class Submission:
+    """What an operator asks for, located: blocks are flat indices, times ms."""
+
+    operator: str
+    reference: str | None
+    aircraft_type: str
+    priority: int
+    origin: Position
+    destination: Position
+    origin_block: int
+    destination_block: int
+    earliest_departure_ms: int
+    latest_departure_ms: int
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A planned path, as `planner.path.Plan`, without its holds."""
+
+    block: IntArray
+    arrive_ms: IntArray
+    depart_ms: IntArray
+    unconstrained_ms: int
+    terminal_dwell_ms: int
+
+    @classmethod
+    def of(cls, plan: Plan) -> "Trajectory":
+        """Keep what the ledger keeps of a plan."""
+        return cls(plan.block, plan.arrive_ms, plan.depart_ms, plan.unconstrained_ms, plan.terminal_dwell_ms)
+
+    @property
+    def departure_ms(self) -> int:
+        """Start of the first hold."""
+        return int(self.arrive_ms[0])
+
+    @property
+    def arrival_ms(self) -> int:
+        """End of the last hold, landing dwell included."""
+        return int(self.depart_ms[-1])
+
+    @property
+    def hover_ms(self) -> int:
+        """Waiting in flight, terminal dwell excluded."""
+        return int((self.depart_ms - self.arrive_ms).sum()) - 2 * self.terminal_dwell_ms
+
+
+@dataclass(frozen=True, eq=False)
+class Reservations:
+    """Half-open reservations [enter, exit) of one flight intent, sorted by enter, then i, j, k."""
+
+    block: IntArray
+    enter_ms: IntArray
+    exit_ms: IntArray
+
+    @classmethod
+    def none(cls) -> "Reservations":
+        """Return an empty set."""
+        empty = np.empty(0, dtype=np.int64)
+        return cls(empty, empty, empty)
+
+    def __len__(self) -> int:
+        return len(self.block)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a recorded intent has no plan; the conflicting intents are ids."""
+
+    reason: str
+    detail: str
+    conflicting_intents: tuple[str, ...] = ()
+    earliest_feasible_departure_ms: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FlightIntent:
+    """A recorded intent: accepted with a trajectory, or rejected with a refusal; every change has a new `version`."""
+
+    id: str
+    sequence: int
+    version: int
+    state: State
+    submission: Submission
+    received_ms: int
+    trajectory: Trajectory | None = None
+    reservations: Reservations = Reservations.none()  # noqa: RUF009 -- frozen and empty
+    refusal: Refusal | None = None
+
+    def changed(self, version: int, state: State, reservations: Reservations) -> "FlightIntent":
+        """Return the intent after a change."""
+        return replace(self, version=version, state=state, reservations=reservations)

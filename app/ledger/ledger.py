@@ -1,0 +1,468 @@
+"""The ledger: every read, and the only writes.
+
+Writes happen in one `Transaction` at a time, which holds the database's write lock from its start. Whoever opens one
+sees everything committed before it, so `sequence` and `revision` are gapless and in the order of the lock.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+from sqlalchemy import Connection, Engine, Row, and_, delete, func, insert, select, update
+from sqlalchemy.exc import DBAPIError, IntegrityError
+
+from app.errors import LedgerUnavailable
+from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
+from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
+from planner.airmatrix import IntArray
+from planner.airspace import Airspace
+
+
+class ReservationOverlap(Exception):
+    """The database refused a reservation because it overlaps another: the caller's picture of the ledger was wrong."""
+
+
+class CommitUncertain(Exception):
+    """COMMIT failed or its connection died: whether the transaction is durable has to be looked up."""
+
+
+@dataclass(frozen=True)
+class JournalEntry:
+    """One line of the append-only journal. `released` (n, 3): block, enter, exit of what the change took away."""
+
+    revision: int
+    time_ms: int
+    kind: str
+    intent_id: str
+    sequence: int
+    released: IntArray
+
+
+@dataclass(frozen=True)
+class IdempotencyRecord:
+    """The first answer to a key: the digest of the body it came with, the intent it made, and the answer's body."""
+
+    body_digest: str
+    intent: FlightIntent
+    answer: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class HeldReservations:
+    """Reservations as columns, with the sequence number of the intent that holds each."""
+
+    block: IntArray
+    enter_ms: IntArray
+    exit_ms: IntArray
+    sequence: IntArray
+
+
+class Ledger:
+    """One ledger: `transaction()` to write, everything else to read."""
+
+    def __init__(self, writer: Engine, reader: Engine, airspace: Airspace) -> None:
+        self._writer = writer
+        self._reader = reader
+        self._airspace = airspace
+
+    def close(self) -> None:
+        """Release all connections."""
+        self._writer.dispose()
+        self._reader.dispose()
+
+    @contextmanager
+    def transaction(self) -> Iterator["Transaction"]:
+        """Take the write lock, and commit at the end; an exception inside undoes everything.
+
+        Raises
+        ------
+        LedgerUnavailable
+            A statement failed: nothing was written.
+        CommitUncertain
+            The COMMIT itself failed: something may have been written.
+        """
+        try:
+            connection = self._writer.connect()
+        except DBAPIError as error:
+            raise LedgerUnavailable(f"the ledger cannot be opened: {error.orig}") from error
+        try:
+            try:
+                connection.begin()
+                yield Transaction(connection, self._airspace)
+            except DBAPIError as error:
+                connection.invalidate()
+                raise LedgerUnavailable(f"the ledger cannot be written: {error.orig}") from error
+            except LedgerUnavailable:
+                connection.invalidate()
+                raise
+            except BaseException:
+                connection.rollback()
+                raise
+            try:
+                connection.commit()
+            except DBAPIError as error:
+                connection.invalidate()
+                raise CommitUncertain(str(error.orig)) from error
+        finally:
+            connection.close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        try:
+            with self._reader.begin() as connection:
+                yield connection
+        except DBAPIError as error:
+            raise LedgerUnavailable(f"the ledger cannot be read: {error.orig}") from error
+
+    def revision(self) -> int:
+        """Return the newest revision."""
+        with self._reading() as connection:
+            return int(connection.execute(select(counters.c.revision)).scalar_one())
+
+    def find(self, intent_id: str) -> FlightIntent | None:
+        """Return an intent with its reservations, None if there is none."""
+        with self._reading() as connection:
+            return _find(connection, self._airspace, intent_id)
+
+    def page(
+        self,
+        *,
+        after_sequence: int,
+        limit: int,
+        operator: str | None = None,
+        state: State | None = None,
+        from_ms: int | None = None,
+        to_ms: int | None = None,
+    ) -> list[FlightIntent]:
+        """Return up to `limit` intents by sequence; `from_ms` and `to_ms` bound flights, or their requests."""
+        begins = func.coalesce(flight_intents.c.departure, flight_intents.c.earliest_departure)
+        ends = func.coalesce(flight_intents.c.arrival, flight_intents.c.latest_departure)
+        wanted = [
+            flight_intents.c.sequence > after_sequence,
+            *([flight_intents.c.operator == operator] if operator is not None else []),
+            *([flight_intents.c.state == state.value] if state is not None else []),
+            *([ends >= from_ms] if from_ms is not None else []),
+            *([begins < to_ms] if to_ms is not None else []),
+        ]
+        query = select(flight_intents).where(and_(*wanted)).order_by(flight_intents.c.sequence).limit(limit)
+        with self._reading() as connection:
+            rows = connection.execute(query).all()
+            held = _reservations(connection, self._airspace, [row.sequence for row in rows])
+        return [_intent(row, self._airspace, held[row.sequence]) for row in rows]
+
+    def all_intents(self, batch: int = 500) -> Iterator[FlightIntent]:
+        """Yield every intent by sequence."""
+        sequence = 0
+        while intents := self.page(after_sequence=sequence, limit=batch):
+            yield from intents
+            sequence = intents[-1].sequence
+
+    def count(self) -> int:
+        """Return how many intents are recorded."""
+        with self._reading() as connection:
+            return int(connection.execute(select(func.count()).select_from(flight_intents)).scalar_one())
+
+    def held_between(self, from_ms: int, to_ms: int, block: int | None = None) -> HeldReservations:
+        """Return the reservations that overlap [from, to), by block and enter."""
+        flying = and_(flight_intents.c.arrival >= from_ms, flight_intents.c.departure < to_ms)
+        query = select(reservations).where(reservations.c.enter < to_ms, reservations.c.exit > from_ms)
+        if block is None:
+            query = query.join(flight_intents, flight_intents.c.sequence == reservations.c.intent).where(flying)
+        else:
+            query = query.where(reservations.c.block == block)
+        with self._reading() as connection:
+            rows = connection.execute(query.order_by(reservations.c.block, reservations.c.enter)).all()
+        return _held(rows)
+
+    def ids(self, sequences: Sequence[int]) -> dict[int, str]:
+        """Return the ids of intents by their sequence numbers."""
+        with self._reading() as connection:
+            return _ids(connection, sequences)
+
+    def journal_after(self, revision: int, limit: int) -> list[JournalEntry]:
+        """Return up to `limit` journal entries after a revision, oldest first."""
+        with self._reading() as connection:
+            return _journal_after(connection, revision, limit)
+
+
+class Transaction:
+    """Work on the ledger under the write lock."""
+
+    def __init__(self, connection: Connection, airspace: Airspace) -> None:
+        self._connection = connection
+        self._airspace = airspace
+        self._sequence, self.revision = connection.execute(select(counters.c.sequence, counters.c.revision)).one()
+
+    @contextmanager
+    def savepoint(self) -> Iterator[None]:
+        """Undo what happens inside if the database refuses it.
+
+        Raises
+        ------
+        ReservationOverlap
+        LedgerUnavailable
+            Any other failure of the database: the whole transaction is lost.
+        """
+        before = self._sequence, self.revision
+        try:
+            with self._connection.begin_nested():
+                yield
+        except IntegrityError as error:
+            self._sequence, self.revision = before
+            raise ReservationOverlap(str(error.orig)) from error
+        except DBAPIError as error:
+            raise LedgerUnavailable(f"the ledger cannot be written: {error.orig}") from error
+        except BaseException:
+            self._sequence, self.revision = before
+            raise
+
+    def record(
+        self,
+        *,
+        intent_id: str,
+        submission: Submission,
+        now_ms: int,
+        trajectory: Trajectory | None = None,
+        reservations: Reservations | None = None,
+        refusal: Refusal | None = None,
+    ) -> FlightIntent:
+        """Insert an intent, accepted with its reservations or rejected, under the next sequence number."""
+        state = State.REJECTED if trajectory is None else State.ACCEPTED
+        self._advance(sequence=True)
+        intent = FlightIntent(
+            id=intent_id,
+            sequence=self._sequence,
+            version=self.revision,
+            state=state,
+            submission=submission,
+            received_ms=now_ms,
+            trajectory=trajectory,
+            reservations=reservations or Reservations.none(),
+            refusal=refusal,
+        )
+        self._connection.execute(insert(flight_intents), _row(intent))
+        self._reserve(intent.sequence, intent.reservations)
+        self._append(intent, now_ms, state.value, released=None)
+        return intent
+
+    def release(self, intent: FlightIntent, state: State, now_ms: int, keep: bool) -> FlightIntent:
+        """Move an intent to another state; unless `keep`, delete its reservations."""
+        self._advance(sequence=False)
+        released = None if keep else intent.reservations
+        if released is not None:
+            self._connection.execute(delete(reservations).where(reservations.c.intent == intent.sequence))
+        changed = intent.changed(self.revision, state, intent.reservations if keep else Reservations.none())
+        self._connection.execute(
+            update(flight_intents)
+            .where(flight_intents.c.sequence == intent.sequence)
+            .values(state=state.value, version=self.revision)
+        )
+        self._append(changed, now_ms, state.value, released)
+        return changed
+
+    def find(self, intent_id: str) -> FlightIntent | None:
+        """Return an intent with its reservations, None if there is none."""
+        return _find(self._connection, self._airspace, intent_id)
+
+    def ids(self, sequences: Sequence[int]) -> dict[int, str]:
+        """Return the ids of intents by their sequence numbers."""
+        return _ids(self._connection, sequences)
+
+    def journal_after(self, revision: int) -> list[JournalEntry]:
+        """Return all journal entries after a revision, oldest first."""
+        return _journal_after(self._connection, revision, None)
+
+    def held_after(self, time_ms: int, sequences: Sequence[int] | None = None) -> HeldReservations:
+        """Return the reservations that end after a time, of all intents or of some, by intent."""
+        query = select(reservations).where(reservations.c.exit > time_ms)
+        if sequences is not None:
+            query = query.where(reservations.c.intent.in_(sequences))
+        return _held(self._connection.execute(query.order_by(reservations.c.intent)).all())
+
+    def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
+        """Return the first answer to an idempotency key, None if it is new."""
+        query = (
+            select(idempotency_keys, flight_intents.c.id)
+            .join(flight_intents, flight_intents.c.sequence == idempotency_keys.c.intent)
+            .where(idempotency_keys.c.operator == operator, idempotency_keys.c.key == key)
+        )
+        row = self._connection.execute(query).one_or_none()
+        if row is None:
+            return None
+        intent = self.find(row.id)
+        assert intent is not None
+        return IdempotencyRecord(row.body_digest, intent, row.answer.encode())
+
+    def remember_answer(
+        self, operator: str, key: str, body_digest: str, intent: FlightIntent, answer: bytes, now_ms: int
+    ) -> None:
+        """Keep the first answer to an idempotency key."""
+        self._connection.execute(
+            insert(idempotency_keys).values(
+                operator=operator, key=key, body_digest=body_digest,
+                intent=intent.sequence, answer=answer.decode(), created=now_ms,
+            )
+        )  # fmt: skip
+
+    def forget_answers(self, before_ms: int) -> None:
+        """Drop idempotency keys first used before a time."""
+        self._connection.execute(delete(idempotency_keys).where(idempotency_keys.c.created < before_ms))
+
+    def _advance(self, *, sequence: bool) -> None:
+        self._sequence += sequence
+        self.revision += 1
+        self._connection.execute(update(counters).values(sequence=self._sequence, revision=self.revision))
+
+    def _append(self, intent: FlightIntent, now_ms: int, kind: str, released: Reservations | None) -> None:
+        self._connection.execute(
+            insert(journal).values(
+                revision=self.revision,
+                time=now_ms,
+                kind=kind,
+                intent=intent.sequence,
+                released=None if released is None else _dump_columns(*_columns(released)),
+            )
+        )
+
+    def _reserve(self, sequence: int, held: Reservations) -> None:
+        """Insert reservations: the only place that does. By driver, since a hundred rows an intent are the hot path."""
+        if len(held):
+            block, enter, leave = (column.tolist() for column in _columns(held))
+            rows = list(zip(block, enter, leave, [sequence] * len(block), strict=True))
+            self._connection.exec_driver_sql(
+                'INSERT INTO reservations (block, enter, "exit", intent) VALUES (?, ?, ?, ?)', rows
+            )
+
+
+def _row(intent: FlightIntent) -> dict[str, object]:
+    submission, trajectory = intent.submission, intent.trajectory
+    return {
+        "sequence": intent.sequence,
+        "id": intent.id,
+        "version": intent.version,
+        "state": intent.state.value,
+        "operator": submission.operator,
+        "reference": submission.reference,
+        "aircraft_type": submission.aircraft_type,
+        "priority": submission.priority,
+        "origin": json.dumps(asdict(submission.origin)),
+        "destination": json.dumps(asdict(submission.destination)),
+        "origin_block": submission.origin_block,
+        "destination_block": submission.destination_block,
+        "earliest_departure": submission.earliest_departure_ms,
+        "latest_departure": submission.latest_departure_ms,
+        "received": intent.received_ms,
+        "departure": None if trajectory is None else trajectory.departure_ms,
+        "arrival": None if trajectory is None else trajectory.arrival_ms,
+        "unconstrained": None if trajectory is None else trajectory.unconstrained_ms,
+        "trajectory": None if trajectory is None else _dump_trajectory(trajectory),
+        "refusal": None if intent.refusal is None else json.dumps(asdict(intent.refusal)),
+    }
+
+
+def _intent(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIntent:
+    trajectory = refusal = None
+    if row.trajectory is not None:
+        trajectory = _load_trajectory(row.trajectory, row.unconstrained, airspace.terminal_dwell_ms)
+    if row.refusal is not None:
+        parts = json.loads(row.refusal)
+        refusal = Refusal(**{**parts, "conflicting_intents": tuple(parts["conflicting_intents"])})
+    return FlightIntent(
+        id=row.id,
+        sequence=row.sequence,
+        version=row.version,
+        state=State(row.state),
+        submission=Submission(
+            operator=row.operator,
+            reference=row.reference,
+            aircraft_type=row.aircraft_type,
+            priority=row.priority,
+            origin=Position(**json.loads(row.origin)),
+            destination=Position(**json.loads(row.destination)),
+            origin_block=row.origin_block,
+            destination_block=row.destination_block,
+            earliest_departure_ms=row.earliest_departure,
+            latest_departure_ms=row.latest_departure,
+        ),
+        received_ms=row.received,
+        trajectory=trajectory,
+        reservations=held,
+        refusal=refusal,
+    )
+
+
+def _find(connection: Connection, airspace: Airspace, intent_id: str) -> FlightIntent | None:
+    row = connection.execute(select(flight_intents).where(flight_intents.c.id == intent_id)).one_or_none()
+    if row is None:
+        return None
+    return _intent(
+        row, airspace, _reservations(connection, airspace, [row.sequence]).get(row.sequence, Reservations.none())
+    )
+
+
+def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:
+    """Return the reservations of some intents, each sorted by enter, then i, j, k."""
+    query = select(reservations).where(reservations.c.intent.in_(sequences))
+    held = _held(connection.execute(query).all())
+    i, j, k = airspace.grid.ijk(held.block).T
+    order = np.lexsort((k, j, i, held.enter_ms, held.sequence))
+    ends = np.searchsorted(held.sequence[order], sequences, side="right")
+    starts = np.searchsorted(held.sequence[order], sequences, side="left")
+    return {
+        sequence: Reservations(
+            held.block[order[start:end]], held.enter_ms[order[start:end]], held.exit_ms[order[start:end]]
+        )
+        for sequence, start, end in zip(sequences, starts, ends, strict=True)
+    }
+
+
+def _held(rows: Sequence[Row[Any]]) -> HeldReservations:
+    columns = np.array([tuple(row) for row in rows], dtype=np.int64).reshape(-1, 4)
+    return HeldReservations(columns[:, 0], columns[:, 1], columns[:, 2], columns[:, 3])
+
+
+def _ids(connection: Connection, sequences: Sequence[int]) -> dict[int, str]:
+    query = select(flight_intents.c.sequence, flight_intents.c.id).where(flight_intents.c.sequence.in_(sequences))
+    return dict(connection.execute(query).tuples().all())
+
+
+def _journal_after(connection: Connection, revision: int, limit: int | None) -> list[JournalEntry]:
+    query = (
+        select(journal, flight_intents.c.id)
+        .join(flight_intents, flight_intents.c.sequence == journal.c.intent)
+        .where(journal.c.revision > revision)
+        .order_by(journal.c.revision)
+        .limit(limit)
+    )
+    return [
+        JournalEntry(
+            row.revision,
+            row.time,
+            row.kind,
+            row.id,
+            row.intent,
+            np.array(json.loads(row.released or "[]"), dtype=np.int64).reshape(-1, 3),
+        )
+        for row in connection.execute(query)
+    ]
+
+
+def _columns(held: Reservations) -> tuple[IntArray, IntArray, IntArray]:
+    return held.block, held.enter_ms, held.exit_ms
+
+
+def _dump_columns(*columns: IntArray) -> str:
+    return orjson.dumps(np.column_stack(columns), option=orjson.OPT_SERIALIZE_NUMPY).decode()
+
+
+def _dump_trajectory(trajectory: Trajectory) -> str:
+    return _dump_columns(trajectory.block, trajectory.arrive_ms, trajectory.depart_ms)
+
+
+def _load_trajectory(text: str, unconstrained_ms: int, terminal_dwell_ms: int) -> Trajectory:
+    block, arrive, depart = np.array(orjson.loads(text), dtype=np.int64).T.copy()
+    return Trajectory(block, arrive, depart, unconstrained_ms, terminal_dwell_ms)

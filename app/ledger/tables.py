@@ -1,0 +1,80 @@
+"""The ledger's tables as queries see them; `migrations` creates them, with their guards."""
+
+from sqlalchemy import BigInteger, Column, Integer, MetaData, Table, Text
+
+metadata = MetaData()
+
+airspace = Table(
+    "airspace",
+    metadata,
+    Column("only", Integer, primary_key=True),
+    Column("id", Text),
+    Column("name", Text),
+    Column("fingerprint", Text),
+)
+
+counters = Table(
+    "counters",
+    metadata,
+    Column("only", Integer, primary_key=True),
+    Column("sequence", BigInteger),
+    Column("revision", BigInteger),
+)
+
+# Times are ms since the epoch; `origin` and `destination` JSON objects of lon, lat, alt_m; `trajectory` a JSON list of
+# [block, arrive, depart]; `refusal` a JSON object. Exactly one of these two is null.
+flight_intents = Table(
+    "flight_intents",
+    metadata,
+    Column("sequence", BigInteger, primary_key=True),
+    Column("id", Text),
+    Column("version", BigInteger),
+    Column("state", Text),
+    Column("operator", Text),
+    Column("reference", Text),
+    Column("aircraft_type", Text),
+    Column("priority", Integer),
+    Column("origin", Text),
+    Column("destination", Text),
+    Column("origin_block", BigInteger),
+    Column("destination_block", BigInteger),
+    Column("earliest_departure", BigInteger),
+    Column("latest_departure", BigInteger),
+    Column("received", BigInteger),
+    Column("departure", BigInteger),
+    Column("arrival", BigInteger),
+    Column("unconstrained", BigInteger),
+    Column("trajectory", Text),
+    Column("refusal", Text),
+)
+
+reservations = Table(
+    "reservations",
+    metadata,
+    Column("block", BigInteger, primary_key=True),
+    Column("enter", BigInteger, primary_key=True),
+    Column("exit", BigInteger),
+    Column("intent", BigInteger),
+)
+
+# `released`: a JSON list of [block, enter, exit] that a change took away, null where it took none.
+journal = Table(
+    "journal",
+    metadata,
+    Column("revision", BigInteger, primary_key=True),
+    Column("time", BigInteger),
+    Column("kind", Text),
+    Column("intent", BigInteger),
+    Column("released", Text),
+)
+
+idempotency_keys = Table(
+    "idempotency_keys",
+    metadata,
+    Column("operator", Text, primary_key=True),
+    Column("key", Text, primary_key=True),
+    Column("body_digest", Text),
+    Column("intent", BigInteger),
+    Column("answer", Text),
+    Column("created", BigInteger),
+)

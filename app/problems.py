@@ -1,0 +1,196 @@
+"""Domain error -> RFC 9457 problem: the only table of HTTP statuses."""
+
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import orjson
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from app import errors
+from app.flight_intents import FlightIntent
+from app.times import format_time
+from planner.errors import NoPlan, NotPlannable
+
+log = structlog.get_logger()
+
+MEDIA_TYPE = "application/problem+json"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of problem: its slug in ``/problems/``, status, title, and what its reader can do."""
+
+    slug: str
+    status: int
+    title: str
+    advice: str
+
+
+KINDS: dict[type[Exception], Kind] = {
+    NotPlannable: Kind(
+        "not-plannable", 422, "No plan can exist for this request",
+        "Change origin or destination; `reason` says which, `nearest_free_block` where to.",
+    ),
+    NoPlan: Kind(
+        "no-conflict-free-plan", 409, "The present traffic leaves no plan",
+        "Submit again with a later departure; `earliest_feasible_departure` is one that works now, where known.",
+    ),
+    errors.UnknownAircraftType: Kind(
+        "unknown-aircraft-type", 422, "Unknown aircraft type", "Choose one from /v1/aircraft-types."
+    ),
+    errors.DepartureInThePast: Kind(
+        "departure-in-the-past", 422, "The departure window has passed", "Choose a later departure."
+    ),
+    errors.BeyondHorizon: Kind(
+        "beyond-horizon", 422, "The departure is too far ahead", "Submit the flight intent nearer to its departure."
+    ),
+    errors.PriorityNotSupported: Kind(
+        "priority-not-supported", 422, "Priorities are not supported", "Leave `priority` out or at 0."
+    ),
+    errors.UnknownFlightIntent: Kind(
+        "unknown-flight-intent", 404, "Unknown flight intent", "Check the id; /v1/flight-intents lists all."
+    ),
+    errors.UnknownBlock: Kind(
+        "unknown-block", 404, "Unknown block", "Blocks are zero-based; `dimensions` in /v1/airspace bounds them."
+    ),
+    errors.IllegalTransition: Kind(
+        "illegal-transition", 409, "The flight intent's state does not allow this", "Read the intent's state first."
+    ),
+    errors.IdempotencyKeyReused: Kind(
+        "idempotency-key-reused", 422, "Idempotency key used with another body", "Use a new key for a new request."
+    ),
+    errors.InvalidCursor: Kind(
+        "invalid-cursor", 422, "Invalid cursor", "Pass `next_cursor` as it came, or leave it out to start again."
+    ),
+    errors.BodyTooLarge: Kind("body-too-large", 413, "The body is too large", "Send fewer bytes."),
+    errors.MalformedRequest: Kind("malformed-request", 400, "Malformed request", "Send a JSON document."),
+    errors.HostNotAllowed: Kind(
+        "host-not-allowed", 421, "Host not served here",
+        "Without authentication only loopback hosts are answered; use 127.0.0.1 or localhost.",
+    ),
+    errors.QueueFull: Kind("queue-full", 503, "Too many requests are waiting", "Try again after `Retry-After` seconds."),
+    errors.LedgerUnavailable: Kind(
+        "ledger-unavailable", 503, "The ledger is unavailable", "Nothing was recorded. Try again later."
+    ),
+}  # fmt: skip
+
+VALIDATION = Kind("validation-error", 422, "Invalid request", "Correct what `errors` lists.")
+INTERNAL = Kind("internal-error", 500, "Internal error", "Report `error_id`; the log has the details.")
+
+
+class Problem(BaseModel):
+    """An RFC 9457 problem document; kinds of problems add members."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str
+    title: str
+    status: int
+    detail: str
+
+
+def kind_of(error: Exception) -> Kind:
+    """Return the kind of problem an error is; `KeyError` if the table lacks it, which is a bug."""
+    for cls in type(error).__mro__:
+        if cls in KINDS:
+            return KINDS[cls]
+    raise KeyError(type(error))
+
+
+def kind_of_status(status: int, title: str) -> Kind:
+    """Return the kind for an HTTP error that is no domain error, such as 404 for an unknown path."""
+    return Kind(title.lower().replace(" ", "-"), status, title, "Check method and path against /docs.")
+
+
+def body(kind: Kind, detail: str, members: Mapping[str, Any] | None = None) -> bytes:
+    """Return a problem document."""
+    return orjson.dumps(
+        {"type": f"/problems/{kind.slug}", "title": kind.title, "status": kind.status, "detail": detail}
+        | dict(members or {})
+    )
+
+
+def response(
+    kind: Kind, detail: str, members: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
+) -> Response:
+    """Return a problem as an HTTP response."""
+    return Response(body(kind, detail, members), kind.status, headers, MEDIA_TYPE)
+
+
+def response_to(error: Exception) -> Response:
+    """Return the response to a domain error."""
+    members: dict[str, Any] = {}
+    if isinstance(error, NotPlannable):
+        members["reason"] = error.reason
+        if error.nearest_free_block is not None:
+            members["nearest_free_block"] = error.nearest_free_block
+    if isinstance(error, NoPlan):
+        members["reason"] = error.reason
+        if error.earliest_feasible_departure_ms is not None:
+            members["earliest_feasible_departure"] = format_time(error.earliest_feasible_departure_ms)
+    headers = {"Retry-After": "1"} if kind_of(error).status == 503 else None
+    return response(kind_of(error), str(error), members, headers)
+
+
+def refusal_body(intent: FlightIntent) -> bytes:
+    """Return the problem document of a recorded refusal."""
+    refusal = intent.refusal
+    assert refusal is not None
+    members: dict[str, Any] = {
+        "reason": refusal.reason,
+        "flight_intent_id": intent.id,
+        "sequence": intent.sequence,
+        "conflicting_intents": refusal.conflicting_intents,
+    }
+    if refusal.earliest_feasible_departure_ms is not None:
+        members["earliest_feasible_departure"] = format_time(refusal.earliest_feasible_departure_ms)
+    return body(KINDS[NoPlan], refusal.detail, members)
+
+
+def install(app: FastAPI) -> None:
+    """Answer every error with a problem."""
+
+    async def domain_error(_: Request, error: Exception) -> Response:
+        return response_to(error)
+
+    async def validation_error(_: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        found = [
+            {"loc": list(item["loc"]), "msg": item["msg"].removeprefix("Value error, "), "type": item["type"]}
+            for item in error.errors()
+        ]
+        if any(item["type"] == "json_invalid" for item in found):
+            return response(KINDS[errors.MalformedRequest], "the body is not valid JSON", {"errors": found})
+        first = f"{'.'.join(str(part) for part in found[0]['loc'])}: {found[0]['msg']}"
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        return response(VALIDATION, first + more, {"errors": found})
+
+    async def http_error(_: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        if error.status_code == 400:
+            return response(KINDS[errors.MalformedRequest], "the body cannot be parsed")
+        kind = kind_of_status(error.status_code, str(error.detail))
+        return response(kind, kind.advice, headers=error.headers)
+
+    async def unexpected_error(request: Request, error: Exception) -> Response:
+        error_id = str(uuid.uuid4())
+        log.error("unexpected error", error_id=error_id, path=request.url.path, exc_info=error)
+        return response(INTERNAL, INTERNAL.advice, {"error_id": error_id})
+
+    for kind in KINDS:
+        app.add_exception_handler(kind, domain_error)
+    app.add_exception_handler(RequestValidationError, validation_error)
+    app.add_exception_handler(HTTPException, http_error)
+    app.add_exception_handler(Exception, unexpected_error)
+
+
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return what OpenAPI says of a route's problems."""
+    return {status: {"model": Problem, "description": "A problem (RFC 9457)"} for status in (*statuses, 500)}

@@ -1,0 +1,34 @@
+"""Every setting of the service, in one object that is passed in. Each is also an ``AIRMATRIX_*`` variable."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from planner.cfa_star import Search
+
+
+class Settings(BaseSettings):
+    """Frozen; unknown ``AIRMATRIX_*`` variables are ignored, malformed ones refused."""
+
+    model_config = SettingsConfigDict(env_prefix="AIRMATRIX_", frozen=True, extra="ignore")
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    ledger: str = "airmatrix.sqlite"
+    airspace: Path | None = None
+    aircraft_types: Path | None = None
+
+    search: Search = Search.SAFE_INTERVAL
+    hover_limit_s: Annotated[float, Field(gt=0)] = 60.0
+    ground_hold_s: Annotated[float, Field(ge=0)] = 300.0
+    horizon_days: Annotated[float, Field(gt=0, le=60)] = 30.0
+    idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
+
+    queue_limit: Annotated[int, Field(ge=1)] = 1024
+    max_body_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
+
+    allow_unauthenticated: bool = False
+    log_format: Literal["console", "json"] = "console"
+    log_level: Literal["debug", "info", "warning", "error"] = "info"

@@ -1,0 +1,63 @@
+"""RFC 3339 at the edge, int64 milliseconds since the Unix epoch inside."""
+
+import re
+import time
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
+
+from planner.airmatrix import IntArray
+
+_RFC3339 = re.compile(
+    r"(\d{4})-(\d\d)-(\d\d)[Tt ](\d\d):(\d\d):(\d\d)(?:\.(\d{1,30}))?(?:([Zz])|([+-])(\d\d):(\d\d))?", re.ASCII
+)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def now_ms() -> int:
+    """Return the system clock."""
+    return time.time_ns() // 1_000_000
+
+
+def parse_time(text: Any) -> int:
+    """Return an RFC 3339 time with any offset in ms, finer fractions rounded up; `ValueError` says what is wrong."""
+    if isinstance(text, int) and not isinstance(text, bool):
+        raise ValueError("expected an RFC 3339 time such as 2026-11-22T08:00:00.000Z, not a number")
+    match = _RFC3339.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise ValueError("expected an RFC 3339 time such as 2026-11-22T08:00:00.000Z")
+    *date, fraction, zulu, sign, hours, minutes = match.groups()
+    if not zulu and not sign:
+        raise ValueError("the time has no offset; end it with Z or an offset such as +05:00")
+    if sign and (int(hours) > 23 or int(minutes) > 59):
+        raise ValueError("the time's offset must lie within 23:59")
+    offset = timedelta(hours=int(hours), minutes=int(minutes)) if sign else timedelta()
+    zone = timezone(-offset if sign == "-" else offset)
+    try:
+        moment = datetime(*(int(part) for part in date), tzinfo=zone)  # type: ignore[arg-type,misc]
+    except ValueError as error:
+        raise ValueError(f"not a date and time: {error}") from error
+    fraction = fraction or ""
+    milliseconds = int(fraction[:3].ljust(3, "0")) + bool(fraction[3:].strip("0"))
+    return (moment - _EPOCH) // timedelta(milliseconds=1) + milliseconds
+
+
+def format_times(times_ms: IntArray) -> list[str]:
+    """Return times as RFC 3339 UTC with milliseconds and Z."""
+    texts: list[str] = np.datetime_as_string(times_ms.astype("datetime64[ms]"), unit="ms", timezone="UTC").tolist()
+    return texts
+
+
+def format_time(time_ms: int) -> str:
+    """Return one time as RFC 3339 UTC with milliseconds and Z."""
+    return format_times(np.array([time_ms], dtype=np.int64))[0]
+
+
+Timestamp = Annotated[
+    int,
+    BeforeValidator(parse_time),
+    PlainSerializer(format_time, return_type=str),
+    WithJsonSchema({"type": "string", "format": "date-time", "examples": ["2026-11-22T08:00:00.000Z"]}),
+]
