@@ -135,6 +135,10 @@ class Deconfliction:
         """How many requests wait."""
         return self._queue.qsize()
 
+    def check(self, origin: int, destination: int) -> None:
+        """Raise the `NotPlannable` that applies to two blocks whatever the traffic. Safe in any thread."""
+        self._planner.check(origin, destination)
+
     async def submit(self, submission: Submission, key: IdempotencyKey | None = None) -> Outcome:
         """Plan and record a submission.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import orjson
 import structlog
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
@@ -75,7 +75,7 @@ KINDS: dict[type[Exception], Kind] = {
         "host-not-allowed", 421, "Host not served here",
         "Without authentication only loopback hosts are answered; use 127.0.0.1 or localhost.",
     ),
-    errors.QueueFull: Kind("queue-full", 503, "Too many requests are waiting", "Try again after `Retry-After` seconds."),
+    errors.QueueFull: Kind("queue-full", 503, "Too many requests are waiting", "Wait `Retry-After` seconds."),
     errors.LedgerUnavailable: Kind(
         "ledger-unavailable", 503, "The ledger is unavailable", "Nothing was recorded. Try again later."
     ),
@@ -94,6 +94,27 @@ class Problem(BaseModel):
     title: str
     status: int
     detail: str
+
+
+class KindAnswer(BaseModel):
+    """What a problem's `type` leads to."""
+
+    type: str
+    title: str
+    status: int
+    advice: str
+
+
+router = APIRouter(prefix="/problems", tags=["running it"])
+
+
+@router.get("/{slug}", summary="Explain a kind of problem")
+async def explain(slug: str) -> KindAnswer:
+    """Say what a problem of this type means and what to do about it."""
+    for kind in (*KINDS.values(), VALIDATION, INTERNAL):
+        if kind.slug == slug:
+            return KindAnswer(type=f"/problems/{slug}", title=kind.title, status=kind.status, advice=kind.advice)
+    raise HTTPException(404)
 
 
 def kind_of(error: Exception) -> Kind:

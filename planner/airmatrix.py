@@ -188,3 +188,8 @@ class AirMatrix:
         x = self.origin_x_m + np.arange(count_i + 1) * self.block_side_m
         y = self.origin_y_m + np.arange(count_j + 1) * self.block_side_m
         return self.unproject(*np.meshgrid(x, y))
+
+
+def _whole(quotient: float) -> int:
+    """Return the whole part of a count; one too large for any grid stays too large, also where it overflows."""
+    return int(min(quotient, 2.0 * MAX_BLOCKS) + _ROUNDING)

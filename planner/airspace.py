@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from planner.airmatrix import AirMatrix
-from planner.errors import AirspaceFileError, Block
+from planner.errors import AirspaceFileError, Block, DestinationBlocked, OriginBlocked
 
 FORMAT = "airmatrix-airspace/1"
 
@@ -84,6 +84,24 @@ class Airspace:
     def occupied_per_layer(self) -> list[int]:
         """Number of statically occupied blocks in each layer, lowest first."""
         return [int(count) for count in self.occupied.reshape(self.grid.dimensions[2], -1).sum(axis=1)]
+
+    def free_block_at(
+        self, lon: float, lat: float, alt_m: float, if_blocked: type[OriginBlocked | DestinationBlocked]
+    ) -> int:
+        """Return the flat index of the free block that contains a position.
+
+        Raises
+        ------
+        OutsideAirspace
+        OriginBlocked, DestinationBlocked
+            The one given as `if_blocked`, with the nearest free block.
+        """
+        block = self.grid.block_at(lon, lat, alt_m)
+        if self.occupied[self.grid.index(block)]:
+            nearest = self.nearest_free_block(lon, lat, alt_m)
+            hint = "" if nearest is None else f"; the nearest free block is {list(nearest)}"
+            raise if_blocked(f"block {list(block)} is occupied by a building{hint}", nearest)
+        return self.grid.index(block)
 
     def nearest_free_block(self, lon: float, lat: float, alt_m: float) -> Block | None:
         """Return the free block whose centre is nearest to a position, None if there is none."""

@@ -1,7 +1,7 @@
 """Plan one flight: request -> arrays -> kernel -> `Plan` or a typed error (paper 3)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from planner.aircraft import AircraftType
@@ -94,21 +94,11 @@ class Planner:
             The present reservations leave no plan.
         """
         self.check(request.origin, request.destination)
-        motion = self._motion(request.performance)
-        task = Task(
-            request.origin,
-            request.destination,
-            request.earliest_departure_ms,
-            request.latest_departure_ms,
-            self.airspace.terminal_dwell_ms,
-            self.hover_limit_ms,
-            stamp=0,
-        )
-        found = self._search(request, motion, task)
+        found = self._search(request)
         if isinstance(found, Plan):
             return found
-        later = self._search(request, motion, task._replace(latest=task.latest + _OUTLOOK_MS))
-        raise self._refusal(found, task, later.departure_ms if isinstance(later, Plan) else None)
+        later = self._search(replace(request, latest_departure_ms=request.latest_departure_ms + _OUTLOOK_MS))
+        raise self._refusal(found, request, later.departure_ms if isinstance(later, Plan) else None)
 
     def unconstrained(self, request: PlanRequest) -> int:
         """Return the flight time without traffic in ms, dwell included: A* under the airspace's rule."""
@@ -130,8 +120,18 @@ class Planner:
         if self._components[origin] != self._components[destination]:
             raise Disconnected("buildings leave no way from the origin's block to the destination's")
 
-    def _search(self, request: PlanRequest, motion: Motion, task: Task) -> Plan | type[NoPlan]:
+    def _search(self, request: PlanRequest) -> Plan | type[NoPlan]:
         """Search and return the plan, or why there is none."""
+        motion = self._motion(request.performance)
+        task = Task(
+            request.origin,
+            request.destination,
+            request.earliest_departure_ms,
+            request.latest_departure_ms,
+            self.airspace.terminal_dwell_ms,
+            self.hover_limit_ms,
+            stamp=0,
+        )
         kernel = search_kernels.greedy if self.search is Search.GREEDY else search_kernels.safe_interval
         status, goal, expansions, disturbed = self._run(kernel, motion, self.index.slabs, task)
         if status != search_kernels.FOUND:
@@ -201,12 +201,13 @@ class Planner:
             self._motions[key] = build_motion(performance.times, self.airspace)
         return self._motions[key]
 
-    def _refusal(self, reason: type[NoPlan], task: Task, feasible_departure_ms: int | None) -> NoPlan:
+    def _refusal(self, reason: type[NoPlan], request: PlanRequest, feasible_departure_ms: int | None) -> NoPlan:
         """Return the error for a request without plan, with what its operator can do about it."""
         owners: tuple[int, ...] = ()
         if reason is NoDepartureSlot:
             message = "the first block is reserved throughout the departure window"
-            owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
+            until_ms = request.latest_departure_ms + self.airspace.terminal_dwell_ms + 1
+            owners = self.index.owners(request.origin, request.earliest_departure_ms, until_ms)
         elif reason is NoConflictFreePath:
             message = "no conflict-free path leads from the first block within the departure window"
         else:

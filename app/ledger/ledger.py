@@ -399,9 +399,7 @@ def _find(connection: Connection, airspace: Airspace, intent_id: str) -> FlightI
     row = connection.execute(select(flight_intents).where(flight_intents.c.id == intent_id)).one_or_none()
     if row is None:
         return None
-    return _intent(
-        row, airspace, _reservations(connection, airspace, [row.sequence]).get(row.sequence, Reservations.none())
-    )
+    return _intent(row, airspace, _reservations(connection, airspace, [row.sequence])[row.sequence])
 
 
 def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:

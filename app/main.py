@@ -1,0 +1,72 @@
+"""The application: routes, problems, OpenAPI. Nothing is opened until its lifespan begins."""
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any, TypedDict
+
+from anyio import to_thread
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from starlette.responses import RedirectResponse
+
+from app import problems, service
+from app.gate import Gate
+from app.routes import aircraft_types, airspace, events, flight_intents, health
+from app.service import Service
+from app.settings import Settings
+from app.times import now_ms
+
+DESCRIPTION = """
+Strategic deconfliction for urban air mobility. Operators submit flight intents; each is planned in order of arrival
+against everything reserved before, and its blocks are reserved durably. Ops staff read the status of the airspace.
+
+Times are RFC 3339 with an offset, answered in UTC with milliseconds. Errors are problem documents (RFC 9457).
+"""
+
+
+class State(TypedDict):
+    """What the lifespan hands to every request."""
+
+    service: Service
+
+
+def create_app(settings: Settings, clock: Callable[[], int] = now_ms) -> FastAPI:
+    """Return the application for these settings."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[State]:
+        running = service.running(settings, clock)
+        yield {"service": await to_thread.run_sync(running.__enter__)}
+        await to_thread.run_sync(running.__exit__, None, None, None)
+
+    app = FastAPI(title="AirMatrix", version=version("airmatrix"), description=DESCRIPTION, lifespan=lifespan)
+    for resource in (flight_intents, aircraft_types, airspace, events, health):
+        app.include_router(resource.router)
+    app.include_router(problems.router)
+    app.add_api_route("/", _to_documentation, include_in_schema=False)
+    problems.install(app)
+    app.add_middleware(Gate, settings=settings)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+async def _to_documentation() -> RedirectResponse:
+    return RedirectResponse("/docs")
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """Return the OpenAPI document, with problems under their own media type."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        problem = {"$ref": "#/components/schemas/Problem"}
+        for path in document["paths"].values():
+            for operation in path.values():
+                for answer in operation["responses"].values():
+                    content = answer.get("content", {})
+                    if content.get("application/json", {}).get("schema") == problem:
+                        content[problems.MEDIA_TYPE] = content.pop("application/json")
+        for unused in ("HTTPValidationError", "ValidationError"):
+            document["components"]["schemas"].pop(unused, None)
+        app.openapi_schema = document
+    return app.openapi_schema

@@ -1,0 +1,1 @@
+"""One file a resource; its bodies stand beside the routes that use them."""

@@ -1,0 +1,51 @@
+"""The append-only journal, paged."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from pydantic import BaseModel
+
+from app import problems
+from app.routes import paging
+from app.service import ServiceDep
+from app.times import Timestamp
+
+router = APIRouter(prefix="/v1/events", tags=["events"])
+
+
+class Event(BaseModel):
+    """One change of the ledger, in the order of the changes."""
+
+    revision: int
+    time: Timestamp
+    kind: str
+    flight_intent_id: str
+    sequence: int
+
+
+class EventPage(BaseModel):
+    """A page of events; `next_cursor` is the `after` of the next, null when there is nothing more yet."""
+
+    items: list[Event]
+    next_cursor: str | None
+
+
+@router.get("", responses=problems.documented(422, 503), summary="Read the journal")
+def list_events(
+    service: ServiceDep,
+    after: Annotated[int, Query(ge=0, le=2**62, description="A revision; 0 for the beginning.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=paging.LIMIT)] = 100,
+) -> EventPage:
+    """Return the changes after a revision, oldest first. Revisions have no gaps."""
+    entries = service.ledger.journal_after(after, limit)
+    items = [
+        Event(
+            revision=entry.revision,
+            time=entry.time_ms,
+            kind=entry.kind,
+            flight_intent_id=entry.intent_id,
+            sequence=entry.sequence,
+        )
+        for entry in entries
+    ]
+    return EventPage(items=items, next_cursor=str(items[-1].revision) if len(items) == limit else None)
