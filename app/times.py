@@ -55,9 +55,13 @@ def format_time(time_ms: int) -> str:
     return format_times(np.array([time_ms], dtype=np.int64))[0]
 
 
-Timestamp = Annotated[
-    int,
-    BeforeValidator(parse_time),
-    PlainSerializer(format_time, return_type=str),
-    WithJsonSchema({"type": "string", "format": "date-time", "examples": ["2026-11-22T08:00:00.000Z"]}),
+_SERIALIZED = PlainSerializer(format_time, return_type=str)
+_SCHEMA = WithJsonSchema({"type": "string", "format": "date-time", "examples": ["2026-11-22T08:00:00.000Z"]})
+
+# A time in a request: only RFC 3339 will do.
+Timestamp = Annotated[int, BeforeValidator(parse_time), _SERIALIZED, _SCHEMA]
+
+# A time in an answer: made from ms by the service, read from RFC 3339 by clients.
+Moment = Annotated[
+    int, BeforeValidator(lambda value: value if isinstance(value, int) else parse_time(value)), _SERIALIZED, _SCHEMA
 ]

@@ -24,7 +24,7 @@ Geometries = npt.NDArray[np.object_]
 OVERLOOKED_M = 0.01
 
 # Legs looked up at once: bounds memory.
-_CHUNK = 20_000
+_CHUNK = 2_000
 
 
 @dataclass(frozen=True)

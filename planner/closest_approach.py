@@ -318,9 +318,10 @@ def _ranks(counts: IntArray) -> IntArray:
 def _cell_keys(midpoints: FloatArray, bucket: IntArray, cell_m: float) -> tuple[IntArray, int]:
     """Number the cells (bucket, x, y), neighbours along y consecutively; also return a column's length.
 
-    An empty margin on every side keeps the neighbours of a cell from belonging to another column or bucket.
+    An empty last cell keeps the neighbours of a column's cells from belonging to the next column, and an empty
+    last column does so for buckets.
     """
-    cells = ((midpoints - midpoints.min(axis=0)) // cell_m).astype(np.int64) + 1
+    cells = ((midpoints - midpoints.min(axis=0)) // cell_m).astype(np.int64)
     columns, column_length = (int(count) for count in cells.max(axis=0) + 2)
     return ((bucket - bucket.min()) * columns + cells[:, 0]) * column_length + cells[:, 1], column_length
 

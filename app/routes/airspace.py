@@ -94,7 +94,7 @@ class BlockStatusAnswer(BaseModel):
 class StatusAnswer(BaseModel):
     """The blocks in use at one time; blocks that are not listed are idle."""
 
-    at: Timestamp
+    at: Moment
     counts: dict[Status, int]
     blocks: list[BlockStatusAnswer]
 
@@ -114,8 +114,8 @@ class ScheduleEntry(BaseModel):
     """A reservation of the block."""
 
     flight_intent_id: str
-    enter: Timestamp
-    exit: Timestamp
+    enter: Moment
+    exit: Moment
 
 
 class BlockAnswer(BaseModel):
@@ -139,8 +139,8 @@ class BlockUse(BaseModel):
 class OccupancyAnswer(BaseModel):
     """Seconds of reserved time of each block in use."""
 
-    from_: Annotated[Timestamp, Field(alias="from")]
-    to: Timestamp
+    from_: Annotated[Moment, Field(alias="from")]
+    to: Moment
     blocks: list[BlockUse]
 
 

@@ -8,7 +8,7 @@ from pydantic import BaseModel
 from app import problems
 from app.routes import paging
 from app.service import ServiceDep
-from app.times import Timestamp
+from app.times import Moment
 
 router = APIRouter(prefix="/v1/events", tags=["events"])
 
@@ -17,7 +17,7 @@ class Event(BaseModel):
     """One change of the ledger, in the order of the changes."""
 
     revision: int
-    time: Timestamp
+    time: Moment
     kind: str
     flight_intent_id: str
     sequence: int

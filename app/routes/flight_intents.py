@@ -14,7 +14,7 @@ from app.errors import PriorityNotSupported, UnknownAircraftType, UnknownFlightI
 from app.flight_intents import FlightIntent, Position, Reservations, State, Submission, Trajectory
 from app.routes import paging
 from app.service import Service, ServiceDep
-from app.times import Timestamp, format_time, format_times
+from app.times import Moment, Timestamp, format_time, format_times
 from planner.airmatrix import AirMatrix
 from planner.errors import DestinationBlocked, NoPlan, OriginBlocked
 
@@ -90,16 +90,16 @@ class Waypoint(BaseModel):
     lon: float
     lat: float
     alt_m: float
-    arrive: Timestamp
-    depart: Timestamp
+    arrive: Moment
+    depart: Moment
 
 
 class Reservation(BaseModel):
     """A block, held from `enter` until before `exit`."""
 
     block: BlockIndices
-    enter: Timestamp
-    exit: Timestamp
+    enter: Moment
+    exit: Moment
 
 
 class RefusalBody(BaseModel):
@@ -108,7 +108,7 @@ class RefusalBody(BaseModel):
     reason: str
     detail: str
     conflicting_intents: list[str]
-    earliest_feasible_departure: Timestamp | None
+    earliest_feasible_departure: Moment | None
 
 
 class PlannedFlightBody(BaseModel):
@@ -121,10 +121,10 @@ class PlannedFlightBody(BaseModel):
     priority: int
     origin: LocatedPosition
     destination: LocatedPosition
-    earliest_departure: Timestamp
-    latest_departure: Timestamp
-    departure: Timestamp | None = None
-    arrival: Timestamp | None = None
+    earliest_departure: Moment
+    latest_departure: Moment
+    departure: Moment | None = None
+    arrival: Moment | None = None
     flight_time_s: float | None = None
     ground_hold_s: float | None = None
     hover_s: float | None = None

@@ -237,6 +237,38 @@ def test_the_closest_approach_is_exact_however_far_the_flights_are(blocks: int) 
     assert nearest(report.closest) == (20 * blocks, 0)
 
 
+@pytest.mark.parametrize("step", [(1, 0), (0, 1), (1, 1), (1, -1)], ids=["east", "north", "north-east", "south-east"])
+def test_the_nearest_pair_is_found_whatever_lies_between_and_however_near_others_are(step: tuple[int, int]) -> None:
+    wide = airspace((30, 30, 1))
+    i, j = step
+
+    report = verify(
+        wide,
+        [
+            flight("corner", ((0, 0, 0), 2000, 3000), within=wide),
+            flight("here", ((2, 2 + (j < 0), 0), 0, 1000), within=wide),
+            flight("there", ((2 + i, 2 + (j > 0), 0), 0, 1000), within=wide),
+            flight("one", ((20, 20, 0), 0, 1000), within=wide),
+            flight("other", ((22, 20, 0), 0, 1000), within=wide),
+        ],
+    )
+
+    assert report.closest is not None
+    assert report.closest.flights == ("here", "there")
+    assert nearest(report.closest) == (round(float(20 * np.hypot(i, j)), 6), 0)
+
+
+def test_every_pair_that_is_too_near_is_found_whatever_the_nearest() -> None:
+    others = (
+        flight("standing", ((4, 3, 1), 0, 1000)),
+        flight("cut", ((3, 3, 1), 0, 0), ((4, 3, 1), 1000, 1000), held=(300, 300)),
+    )
+
+    report = verify(AIRSPACE, [*HEAD_ON, *others])
+
+    assert too_near(report) == {frozenset({"east", "west"}), frozenset({"standing", "cut"})}
+
+
 def test_under_the_midpoint_rule_what_comes_near_is_reported_and_no_violation() -> None:
     report = verify(MIDPOINT, [flight(one.id, *stops_of(one), within=MIDPOINT, holds=[]) for one in HEAD_ON])
 
@@ -306,6 +338,7 @@ def test_reservations_on_buildings_outside_the_grid_or_without_duration_are_foun
         [
             CheckedFlight("one", *columns([]), *columns([(1, 0, 9), (outside, 10, 19), (-1, 20, 29)])),
             flight("two", holds=[((2, 0, 0), 5, 5), ((3, 0, 0), 7, 6), ((4, 0, 0), 7, 8)]),
+            flight("three", holds=[((2, 0, 0), 0, 10), ((3, 0, 0), 0, 10)]),
         ],
     )
 
@@ -505,7 +538,7 @@ def test_a_diagonal_that_cuts_a_buildings_corner_is_found() -> None:
 
 
 def test_half_a_block_from_a_building_is_clear() -> None:
-    built = airspace(buildings=(building(300, box(0, 20, 60, 40)),))
+    built = airspace(buildings=(building(300, box(19, 20, 21, 40)),))
 
     report = verify(built, [flight("along", ((0, 0, 0), 0, 0), ((1, 0, 0), 1000, 1000))])
 
@@ -536,15 +569,16 @@ def test_a_roof_half_a_block_height_below_is_far_enough(height_m: float, clear: 
     assert report.clearance is None if clear else clearance_m(report) == 0
 
 
-def test_only_the_part_of_a_leg_that_is_low_is_near_a_building() -> None:
-    # Sinking from 60 m over block 2 to 20 m over block 1 and on to block 0: it is below 30 m + 20 m from x = 45 m.
+@pytest.mark.parametrize("climbs", [False, True], ids=["sinking", "climbing"])
+def test_only_the_part_of_a_leg_that_is_low_is_near_a_building(climbs: bool) -> None:
+    # From 60 m over block 2 to 20 m over block 1 and on to block 0: it is below 30 m + 20 m up to x = 45 m.
     built = airspace(buildings=(building(30, box(48, 0, 58, 20)),))
     sinking = (((2, 0, 1), 0, 0), ((1, 0, 0), 4000, 4000), ((0, 0, 0), 6000, 6000))
 
-    report = verify(built, [flight("sinking", *sinking), flight("climbing", *reversed_in_time(sinking))])
+    report = verify(built, [flight("one", *(reversed_in_time(sinking) if climbs else sinking))])
 
     assert clearance_m(report) == 3
-    assert [flights for flights, *_ in found(report, Kind.BUILDING)] == [("sinking",), ("climbing",)]
+    assert len(found(report, Kind.BUILDING)) == 1
 
 
 def reversed_in_time(stops: tuple[Stop, ...]) -> list[Stop]:
@@ -577,16 +611,20 @@ def test_the_clearance_is_exact_however_far_the_building_is() -> None:
 
 
 def test_every_flight_on_a_link_that_is_too_near_is_named() -> None:
-    built = airspace(buildings=(building(30, box(20, 0, 40, 20)),))
-    there_and_back = [
+    cut_by_a_corner = building(30, box(20, 0, 40, 20))
+    four_metres_aside = building(30, box(94, 88, 96, 92))
+    built = airspace(buildings=(cut_by_a_corner, four_metres_aside))
+    flights = [
         flight("there", *DIAGONAL),
         flight("back", *reversed_in_time(DIAGONAL)),
-        flight("elsewhere", ((4, 4, 0), 0, 0), ((5, 5, 0), 1000, 1000)),
+        flight("cut before the corner", *DIAGONAL, held=(0, 0)),
+        flight("elsewhere", ((4, 4, 0), 0, 1000)),
+        flight("clear", ((0, 4, 0), 0, 0), ((0, 5, 0), 1000, 1000)),
     ]
 
-    report = verify(built, there_and_back)
+    report = verify(built, flights)
 
-    assert sorted(flights for flights, *_ in found(report, Kind.BUILDING)) == [("back",), ("there",)]
+    assert sorted(named for named, *_ in found(report, Kind.BUILDING)) == [("back",), ("elsewhere",), ("there",)]
 
 
 # Everything is looked at
@@ -624,6 +662,19 @@ def test_a_crowd_is_judged_completely() -> None:
         report = verify(tall, [*crowd, flight("intruder", (tall.grid.block(place), 500, 600), within=tall)])
         assert too_near(report) == {frozenset({"intruder", str(place)})}
         assert found(report, Kind.OVERLAP) == [((str(place), "intruder"), tall.grid.block(place), 500, 601)]
+
+
+@pytest.mark.parametrize("place", [0, 1300, 2499])
+def test_a_crowd_is_judged_completely_against_buildings(place: int) -> None:
+    """More links and stands than are looked up at once."""
+    x, y = (AIRSPACE.grid.block_side_m * (part + 0.5) for part in (place % 50, place // 50))
+    wide = airspace((50, 50, 1), buildings=(building(30, box(x + 3, y, x + 4, y + 1)),))
+    crowd = [flight(str(number), (wide.grid.block(number), 0, 9), within=wide) for number in range(2500)]
+
+    report = verify(wide, crowd)
+
+    assert clearance_m(report) == 3
+    assert found(report, Kind.BUILDING) == [((str(place),), wide.grid.block(place), 0, 0)]
 
 
 def test_progress_is_reported_for_each_stage() -> None:
