@@ -14,7 +14,7 @@ from app.block_status import BlockStatus, Status, statuses
 from app.errors import UnknownBlock
 from app.routes.flight_intents import BlockIndices
 from app.service import Service, ServiceDep
-from app.times import Timestamp, format_time
+from app.times import Moment, Timestamp, format_time
 from planner.airmatrix import AirMatrix
 from planner.airspace import building_feature
 
