@@ -31,14 +31,17 @@ class State(TypedDict):
     service: Service
 
 
-def create_app(settings: Settings, clock: Callable[[], int] = now_ms) -> FastAPI:
-    """Return the application for these settings."""
+def create_app(settings: Settings, clock: Callable[[], int] = now_ms, *, running: Service | None = None) -> FastAPI:
+    """Return the application for these settings. Its lifespan starts a service, unless one is `running` already."""
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[State]:
-        running = service.running(settings, clock)
-        yield {"service": await to_thread.run_sync(running.__enter__)}
-        await to_thread.run_sync(running.__exit__, None, None, None)
+        if running is not None:
+            yield {"service": running}
+            return
+        starting = service.running(settings, clock)
+        yield {"service": await to_thread.run_sync(starting.__enter__)}
+        await to_thread.run_sync(starting.__exit__, None, None, None)
 
     app = FastAPI(title="AirMatrix", version=version("airmatrix"), description=DESCRIPTION, lifespan=lifespan)
     for resource in (flight_intents, aircraft_types, airspace, events, health):

@@ -55,6 +55,14 @@ def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
     """
     auth.check_listening(settings)
     airspace = load_airspace(settings)
+    log.info(
+        "airspace",
+        airspace=airspace.id,
+        rule=airspace.rule.value,
+        buildings=len(airspace.buildings),
+        occupied=airspace.occupied_per_layer,
+        bounds=[round(degrees, 6) for degrees in airspace.grid.bounds],
+    )
     aircraft_types = load_aircraft_types(settings)
     performances = {id_: Performance.of(aircraft, airspace.grid) for id_, aircraft in aircraft_types.items()}
     planner = Planner(airspace, settings.search, int(settings.hover_limit_s * 1000))
@@ -70,7 +78,7 @@ def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
     )
     deconfliction = Deconfliction(ledger, planner, performances, clock, policy)
     deconfliction.start()
-    log.info("ready", airspace=airspace.id, rule=airspace.rule.value, ledger=settings.ledger)
+    log.info("ready", ledger=settings.ledger)
     try:
         yield Service(settings, airspace, aircraft_types, ledger, deconfliction, clock)
     finally:

@@ -32,3 +32,8 @@ class Settings(BaseSettings):
     allow_unauthenticated: bool = False
     log_format: Literal["console", "json"] = "console"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @classmethod
+    def given(cls, **options: object) -> "Settings":
+        """Return settings where the options that are not None win over the environment."""
+        return cls.model_validate({name: value for name, value in options.items() if value is not None})

@@ -6,7 +6,6 @@ bounds-check flag, and then runs stale machine code. So each state of the source
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -29,7 +28,7 @@ def cache_folder() -> Path:
     elif os.access(here, os.W_OK):
         root = here / "__pycache__"
     else:
-        root = Path(tempfile.gettempdir()) / f"airmatrix-kernels-{os.getuid()}"
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "airmatrix"
     return root / digest.hexdigest()[:16]
 
 

@@ -183,17 +183,22 @@ def situations(draw: st.DrawFn) -> Situation:
 def situations_with_endurance(draw: st.DrawFn) -> Situation:
     """Draw a flight in traffic with about the endurance that it needs without traffic.
 
-    The window often has several departure slots: an early one for a long flight, a later one for a short flight.
+    Often the window has an early departure slot, from which the flight waits for the last block, and a late one.
     """
     situation = draw(situations())
     request = situation.request
-    endurance_ms = flight_time_without_traffic(situation.airspace, request) or 2
+    needed_ms = flight_time_without_traffic(situation.airspace, request) or 2
     if draw(st.booleans()):
-        window = draw(st.integers(0, 60))
-        request = replace(request, latest_departure_ms=request.earliest_departure_ms + window)
-        slots = request.earliest_departure_ms + situation.airspace.terminal_dwell_ms + draw(st.integers(3, 12))
-        stay = draw(st.integers(4, 40))
-        reservations = [hold for hold in situation.reservations if hold.block != request.origin]
-        situation = replace(situation, reservations=(*reservations, Hold(request.origin, slots, slots + stay)))
-    endurance_ms += draw(st.one_of(st.integers(-2, 4), st.integers(0, 20)))
+        request = replace(request, latest_departure_ms=request.earliest_departure_ms + draw(st.integers(0, 60)))
+        slot_end = request.earliest_departure_ms + situation.airspace.terminal_dwell_ms + draw(st.integers(3, 12))
+        elsewhere = [hold for hold in situation.reservations if hold.block not in (request.origin, request.destination)]
+        situation = replace(
+            situation,
+            reservations=(
+                *elsewhere,
+                Hold(request.origin, slot_end, slot_end + draw(st.integers(4, 40))),
+                Hold(request.destination, 0, slot_end + draw(st.integers(0, 50))),
+            ),
+        )
+    endurance_ms = needed_ms + draw(st.one_of(st.integers(-2, 4), st.integers(0, 20)))
     return replace(situation, request=_with_endurance(request, endurance_ms))

@@ -1,0 +1,39 @@
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install serve test lint lock openapi
+
+help:  ## Show these targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+$(INSTALLED): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "AirMatrix needs Python 3.11 or newer; name one with PYTHON=..."; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --disable-pip-version-check --quiet --require-hashes -r requirements.lock
+	$(BIN)/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+install: $(INSTALLED)  ## Create .venv with everything locked
+
+serve: $(INSTALLED)  ## Run the service on http://127.0.0.1:8000
+	$(BIN)/airmatrix serve
+
+test: $(INSTALLED)  ## Run the tests
+	$(BIN)/pytest
+
+lint: $(INSTALLED)  ## Check style, types, layers and the container files
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/hadolint docker/Dockerfile
+	$(BIN)/yamllint --strict docker
+
+lock:  ## Renew requirements.lock (needs uv)
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --upgrade --group dev pyproject.toml -o requirements.lock
+
+openapi: $(INSTALLED)  ## Write openapi/airmatrix.json anew
+	$(BIN)/airmatrix openapi --out openapi/airmatrix.json

@@ -1,0 +1,150 @@
+"""A small typed client of the HTTP API.
+
+ClientError
+├── ServiceUnreachable   no answer
+└── ProblemAnswer        the service answered with a problem document
+"""
+
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel
+
+from app.flight_intents import State
+from app.routes.aircraft_types import AircraftTypeAnswer, AircraftTypeList
+from app.routes.airspace import AirspaceAnswer, StaticAnswer, StatusAnswer
+from app.routes.events import EventPage
+from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody, FlightIntentPage, PlannedFlightBody
+from app.routes.health import Readiness
+from app.times import format_time
+from planner.airmatrix import AirMatrix
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+Answer = TypeVar("Answer", bound=BaseModel)
+
+
+class ClientError(Exception):
+    """The service did not do what was asked."""
+
+
+class ServiceUnreachable(ClientError):
+    """The service did not answer."""
+
+
+class ProblemAnswer(ClientError):
+    """The service answered with a problem; `members` is the whole document."""
+
+    def __init__(self, status: int, members: dict[str, Any]) -> None:
+        super().__init__(f"{status} {members.get('title', '')}: {members.get('detail', '')}")
+        self.status = status
+        self.members = members
+
+    @property
+    def reason(self) -> str:
+        """The machine-readable reason, or the problem's slug where it has none."""
+        return str(self.members.get("reason") or str(self.members.get("type", "unknown")).rpartition("/")[2])
+
+
+class Client:
+    """One connection pool to one service; use it as a context manager. Methods raise `ClientError`."""
+
+    def __init__(
+        self, url: str = DEFAULT_URL, timeout_s: float = 30.0, transport: httpx.BaseTransport | None = None
+    ) -> None:
+        self._http = httpx.Client(base_url=url, timeout=timeout_s, transport=transport)
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._http.close()
+
+    def submit(self, body: FlightIntentBody, idempotency_key: str | None = None) -> FlightIntentAnswer:
+        """Submit a flight intent; a refusal is a `ProblemAnswer` with status 409 or 422."""
+        headers = {} if idempotency_key is None else {"Idempotency-Key": idempotency_key}
+        return self._send(FlightIntentAnswer, "POST", "/v1/flight-intents", json=_json(body), headers=headers)
+
+    def preview(self, body: FlightIntentBody) -> PlannedFlightBody:
+        """Plan a flight without reserving it."""
+        return self._send(PlannedFlightBody, "POST", "/v1/flight-intents/preview", json=_json(body))
+
+    def flight_intent(self, intent_id: str) -> FlightIntentAnswer:
+        """Read a flight intent."""
+        return self._send(FlightIntentAnswer, "GET", f"/v1/flight-intents/{intent_id}")
+
+    def flight_intents(self, operator: str | None = None, state: State | None = None) -> Iterator[FlightIntentAnswer]:
+        """Yield all flight intents by sequence, page by page."""
+        wanted = {"operator": operator, "state": None if state is None else state.value}
+        parameters = {name: value for name, value in wanted.items() if value is not None}
+        while True:
+            page = self._send(FlightIntentPage, "GET", "/v1/flight-intents", params=parameters)
+            yield from page.items
+            if page.next_cursor is None:
+                return
+            parameters["cursor"] = page.next_cursor
+
+    def cancel(self, intent_id: str) -> FlightIntentAnswer:
+        """Cancel a flight intent."""
+        return self._send(FlightIntentAnswer, "DELETE", f"/v1/flight-intents/{intent_id}")
+
+    def airspace(self) -> AirspaceAnswer:
+        """Read the airspace."""
+        return self._send(AirspaceAnswer, "GET", "/v1/airspace")
+
+    def static_blocks(self) -> StaticAnswer:
+        """List the statically occupied blocks."""
+        return self._send(StaticAnswer, "GET", "/v1/airspace/static")
+
+    def aircraft_types(self) -> list[AircraftTypeAnswer]:
+        """List the aircraft types."""
+        return self._send(AircraftTypeList, "GET", "/v1/aircraft-types").items
+
+    def status(self, at_ms: int | None = None) -> StatusAnswer:
+        """Read the blocks in use, now by default."""
+        parameters = {} if at_ms is None else {"at": format_time(at_ms)}
+        return self._send(StatusAnswer, "GET", "/v1/airspace/status", params=parameters)
+
+    def events(self, after: int = 0) -> EventPage:
+        """Read a page of the journal."""
+        return self._send(EventPage, "GET", "/v1/events", params={"after": str(after)})
+
+    def readiness(self) -> Readiness:
+        """Ask whether the service is ready; `ProblemAnswer` with status 503 if not."""
+        return self._send(Readiness, "GET", "/health/ready")
+
+    def _send(self, answer: type[Answer], method: str, path: str, **arguments: Any) -> Answer:
+        try:
+            response = self._http.request(method, path, **arguments)
+        except httpx.TransportError as error:
+            raise ServiceUnreachable(
+                f"no answer from {self._http.base_url}: {error or type(error).__name__}"
+            ) from error
+        if response.is_error:
+            raise ProblemAnswer(response.status_code, _members(response))
+        return answer.model_validate_json(response.content)
+
+
+def grid_of(answer: AirspaceAnswer) -> AirMatrix:
+    """Return the grid that an airspace's answer describes."""
+    return AirMatrix(
+        epsg=int(answer.crs.removeprefix("EPSG:")),
+        origin_x_m=answer.origin.x,
+        origin_y_m=answer.origin.y,
+        block_side_m=answer.block_side_m,
+        block_height_m=answer.block_height_m,
+        dimensions=answer.dimensions,
+    )
+
+
+def _json(body: FlightIntentBody) -> dict[str, Any]:
+    return body.model_dump(mode="json", exclude_none=True)
+
+
+def _members(response: httpx.Response) -> dict[str, Any]:
+    try:
+        members = response.json()
+    except ValueError:
+        members = None
+    return members if isinstance(members, dict) else {"title": response.reason_phrase, "detail": response.text[:500]}

@@ -1,0 +1,1 @@
+"""The `airmatrix` commands that are more than a line; `app.cli` puts them together."""
