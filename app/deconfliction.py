@@ -179,6 +179,8 @@ class Deconfliction:
         return await self._enqueue(lambda tx, now: self._cancel(tx, now, intent_id), look_up)
 
     async def _enqueue(self, run: Callable[[Transaction, int], Answer], look_up: Callable[[], Answer | None]) -> Answer:
+        if not self.is_running:
+            raise LedgerUnavailable("the ledger writer has stopped")
         future: Future[Answer] = Future()
         try:
             self._queue.put_nowait(_Job(run, look_up, future))  # type: ignore[arg-type]
@@ -191,6 +193,14 @@ class Deconfliction:
         return self._watermark_ms
 
     def _work(self) -> None:
+        try:
+            self._serve()
+        finally:
+            while not self._queue.empty():
+                if (job := self._queue.get_nowait()) is not None:
+                    job.future.set_exception(LedgerUnavailable("the ledger writer has stopped; nothing was recorded"))
+
+    def _serve(self) -> None:
         while not self._stopping and (first := self._queue.get()) is not None:
             taken = [first]
             answers: list[object]

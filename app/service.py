@@ -71,6 +71,8 @@ def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
     if not kernels_are_compiled():
         log.info("compiling the planner's kernels, once per version; this takes about half a minute")
     warm_up()
+    # Opening the projection takes as long as a hundred plans: not in the first request.
+    airspace.grid.project(*airspace.grid.bounds[:2])
     policy = Policy(
         horizon_ms=int(settings.horizon_days * 86_400_000),
         idempotency_ms=int(settings.idempotency_hours * 3_600_000),

@@ -20,6 +20,7 @@ from planner.errors import (
 from planner.kernels import path as path_kernels
 from planner.kernels import search as search_kernels
 from planner.kernels.connectivity import label_components
+from planner.kernels.heap import BLOCK, GAP_END
 from planner.kernels.heap import G as LABEL_G
 from planner.kernels.intervals import Slabs, empty_slabs
 from planner.kernels.search import Motion, Task
@@ -30,6 +31,8 @@ from planner.path import Plan
 # How far beyond the requested window a refusal looks for a departure that would work; within what keys can order.
 _OUTLOOK_MS = 1 << 31
 _INITIAL_LABELS = 1 << 14
+# A refusal names the flights around as many labels at most: a flight that is shut in has few.
+_SHUT_IN_LABELS = 100
 
 
 class Search(StrEnum):
@@ -77,7 +80,8 @@ class Planner:
         self.hover_limit_ms = hover_limit_ms
         self.index = OccupancyIndex(airspace.grid.block_count)
         self._open_links = open_links(airspace)
-        self._components = label_components(self._open_links, build_offsets(airspace.grid))
+        self._offsets = build_offsets(airspace.grid)
+        self._components = label_components(self._open_links, self._offsets)
         self._empty = empty_slabs(airspace.grid.block_count, pool_size=1)
         self._workspace = search_kernels.new_workspace(airspace.grid.block_count, _INITIAL_LABELS)
         self._stamp = 0
@@ -98,7 +102,9 @@ class Planner:
         if isinstance(found, Plan):
             return found
         later = self._search(replace(request, latest_departure_ms=request.latest_departure_ms + _OUTLOOK_MS))
-        raise self._refusal(found, request, later.departure_ms if isinstance(later, Plan) else None)
+        if isinstance(later, Plan):
+            found.earliest_feasible_departure_ms = later.departure_ms
+        raise found
 
     def unconstrained(self, request: PlanRequest) -> int:
         """Return the flight time without traffic in ms, dwell included: A* under the airspace's rule."""
@@ -120,8 +126,8 @@ class Planner:
         if self._components[origin] != self._components[destination]:
             raise Disconnected("buildings leave no way from the origin's block to the destination's")
 
-    def _search(self, request: PlanRequest) -> Plan | type[NoPlan]:
-        """Search and return the plan, or why there is none."""
+    def _search(self, request: PlanRequest) -> Plan | NoPlan:
+        """Search and return the plan, or the error that says why there is none."""
         motion = self._motion(request.performance)
         task = Task(
             request.origin,
@@ -132,20 +138,38 @@ class Planner:
             self.hover_limit_ms,
             stamp=0,
         )
+        slabs = self.index.slabs
         kernel = search_kernels.greedy if self.search is Search.GREEDY else search_kernels.safe_interval
-        status, goal, expansions, disturbed = self._run(kernel, motion, self.index.slabs, task)
-        if status != search_kernels.FOUND:
-            return NoDepartureSlot if status == search_kernels.NO_DEPARTURE_SLOT else NoConflictFreePath
-        plan = self._plan(motion, task, goal, expansions, disturbed)
+        status, label, expansions, disturbed = self._run(kernel, motion, slabs, task)
+        if status == search_kernels.NO_DEPARTURE_SLOT:
+            owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
+            return NoDepartureSlot("the first block is reserved throughout the departure window", owners)
+        if status == search_kernels.NO_PATH:
+            return NoConflictFreePath(
+                "no conflict-free path leads from the first block within the departure window",
+                self._owners_around(label),
+            )
+        plan = self._plan(motion, task, label, expansions, disturbed)
         endurance = request.performance.endurance_ms
         if endurance is None or plan.flight_time_ms <= endurance:
             return plan
-        if self.search is Search.GREEDY:
-            return EnduranceExceeded
-        status, goal, further, _ = self._run(search_kernels.within_endurance, motion, self.index.slabs, task, endurance)
-        if status != search_kernels.FOUND:
-            return EnduranceExceeded
-        return self._plan(motion, task, goal, expansions + further, disturbed=True)
+        if self.search is Search.SAFE_INTERVAL:
+            status, label, further, _ = self._run(search_kernels.within_endurance, motion, slabs, task, endurance)
+            if status == search_kernels.FOUND:
+                return self._plan(motion, task, label, expansions + further, disturbed=True)
+        return EnduranceExceeded(
+            f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s"
+        )
+
+    def _owners_around(self, labels: int) -> tuple[int, ...]:
+        """Return the owners of the reservations that shut in a search without a path, in the order it met them."""
+        owners: dict[int, None] = {}
+        for label in self._workspace.labels[: min(labels, _SHUT_IN_LABELS)]:
+            block, open_links = label[BLOCK], self._open_links[label[BLOCK]]
+            near = [block, *(block + offset for link, offset in enumerate(self._offsets) if open_links >> link & 1)]
+            for place in near:
+                owners.update(dict.fromkeys(self.index.owners(place, label[LABEL_G], label[GAP_END] + 1)))
+        return tuple(owners)
 
     def _run(
         self,
@@ -200,16 +224,3 @@ class Planner:
         if key not in self._motions:
             self._motions[key] = build_motion(performance.times, self.airspace)
         return self._motions[key]
-
-    def _refusal(self, reason: type[NoPlan], request: PlanRequest, feasible_departure_ms: int | None) -> NoPlan:
-        """Return the error for a request without plan, with what its operator can do about it."""
-        owners: tuple[int, ...] = ()
-        if reason is NoDepartureSlot:
-            message = "the first block is reserved throughout the departure window"
-            until_ms = request.latest_departure_ms + self.airspace.terminal_dwell_ms + 1
-            owners = self.index.owners(request.origin, request.earliest_departure_ms, until_ms)
-        elif reason is NoConflictFreePath:
-            message = "no conflict-free path leads from the first block within the departure window"
-        else:
-            message = "every conflict-free plan takes longer than the aircraft's endurance"
-        return reason(message, owners, feasible_departure_ms)

@@ -288,7 +288,8 @@ def safe_interval(
     of waiting, the label is put back to be resumed at `resume`, the first such start, as if it arrived then. So
     reservations far in the future cost nothing.
 
-    Returns status, goal label, expansions, and whether traffic changed anything (if not, this was plain A*).
+    Returns status, goal label (without a path, how many labels there are), expansions, and whether traffic changed
+    anything (if not, this was plain A*).
     """
     shape, links, near = motion
     table, pool, _ = slabs
@@ -363,7 +364,7 @@ def safe_interval(
         if resume < FAR_FUTURE and resume + h <= bound:
             labels[label, RESUME] = resume
             size = push(heap, size, labels, heap_key(resume + h - task.earliest, h), ~label)
-    return NO_PATH, -1, expansions, True
+    return NO_PATH, count, expansions, True
 
 
 @kernel
@@ -435,7 +436,7 @@ def greedy(open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, ta
             labels[node, PARENT] = min_F
             labels[node, START] = s
             size = open_label(heap, size, labels, node, task.earliest)
-    return NO_PATH, -1, expansions, True
+    return NO_PATH, count, expansions, True
 
 
 @kernel
@@ -539,4 +540,4 @@ def within_endurance(
                     size = open_label(heap, size, labels, count, task.earliest)
                     count += 1
                 tau = until + 1
-    return NO_PATH, -1, expansions, True
+    return NO_PATH, count, expansions, True
