@@ -1,7 +1,7 @@
 """What a running process holds: built once at start, handed to the routes, closed at the end."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Annotated, cast
 
@@ -65,27 +65,26 @@ def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
     )
     aircraft_types = load_aircraft_types(settings)
     performances = {id_: Performance.of(aircraft, airspace.grid) for id_, aircraft in aircraft_types.items()}
-    planner = Planner(airspace, settings.search, int(settings.hover_limit_s * 1000))
     create_or_upgrade(settings.ledger)
-    ledger = open_ledger(settings.ledger, airspace, claim=True)
-    if not kernels_are_compiled():
-        log.info("compiling the planner's kernels, once per version; this takes about half a minute")
-    warm_up()
-    # Opening the projection takes as long as a hundred plans: not in the first request.
-    airspace.grid.project(*airspace.grid.bounds[:2])
-    policy = Policy(
-        horizon_ms=int(settings.horizon_days * 86_400_000),
-        idempotency_ms=int(settings.idempotency_hours * 3_600_000),
-        queue_limit=settings.queue_limit,
-    )
-    deconfliction = Deconfliction(ledger, planner, performances, clock, policy)
-    deconfliction.start()
-    log.info("ready", ledger=settings.ledger)
-    try:
-        yield Service(settings, airspace, aircraft_types, ledger, deconfliction, clock)
-    finally:
-        deconfliction.stop()
-        ledger.close()
+    with closing(open_ledger(settings.ledger, airspace, claim=True)) as ledger:
+        if not kernels_are_compiled():
+            log.info("compiling the planner's kernels, once per version; this takes some ten seconds")
+        warm_up()
+        # Opening the projection takes as long as a hundred plans: not in the first request.
+        airspace.grid.project(*airspace.grid.bounds[:2])
+        planner = Planner(airspace, settings.search, int(settings.hover_limit_s * 1000))
+        policy = Policy(
+            horizon_ms=int(settings.horizon_days * 86_400_000),
+            idempotency_ms=int(settings.idempotency_hours * 3_600_000),
+            queue_limit=settings.queue_limit,
+        )
+        deconfliction = Deconfliction(ledger, planner, performances, clock, policy)
+        deconfliction.start()
+        log.info("ready", ledger=settings.ledger)
+        try:
+            yield Service(settings, airspace, aircraft_types, ledger, deconfliction, clock)
+        finally:
+            deconfliction.stop()
 
 
 def of_request(request: Request) -> Service:

@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 import orjson
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -59,7 +60,8 @@ def plan(
 
 
 def _print(grid: AirMatrix, path: Plan, aircraft: str) -> None:
-    table = Table(title=f"{aircraft}: {path.flight_time_ms / 1000:.3f} s, {len(path.hold_block)} reservations")
+    title = f"{aircraft}: {path.flight_time_ms / 1000:.3f} s, {len(path.hold_block)} reservations"
+    table = Table(title=title, box=box.SIMPLE)
     for column in ("block", "lon", "lat", "alt m", "arrive", "depart"):
         table.add_column(column)
     for block, (lon, lat, alt_m), arrive, depart in zip(
