@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import orjson
-from sqlalchemy import Connection, Engine, Row, and_, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Engine, Row, and_, case, delete, func, insert, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.errors import LedgerUnavailable
@@ -168,15 +168,29 @@ class Ledger:
 
     def held_between(self, from_ms: int, to_ms: int, block: int | None = None) -> HeldReservations:
         """Return the reservations that overlap [from, to), by block and enter."""
-        flying = and_(flight_intents.c.arrival >= from_ms, flight_intents.c.departure < to_ms)
         query = select(reservations).where(reservations.c.enter < to_ms, reservations.c.exit > from_ms)
         if block is None:
-            query = query.join(flight_intents, flight_intents.c.sequence == reservations.c.intent).where(flying)
+            query = query.where(_in_the_air(from_ms, to_ms))
         else:
             query = query.where(reservations.c.block == block)
         with self._reading() as connection:
             rows = connection.execute(query.order_by(reservations.c.block, reservations.c.enter)).all()
         return _held(rows)
+
+    def use_between(self, from_ms: int, to_ms: int) -> tuple[IntArray, IntArray]:
+        """Return the blocks reserved within [from, to), and for how many ms of it: two arrays (n,)."""
+        enter, leave = reservations.c.enter, reservations.c.exit
+        ends = case((leave < to_ms, leave), else_=to_ms)
+        begins = case((enter > from_ms, enter), else_=from_ms)
+        query = (
+            select(reservations.c.block, func.sum(ends - begins))
+            .where(enter < to_ms, leave > from_ms, _in_the_air(from_ms, to_ms))
+            .group_by(reservations.c.block)
+            .order_by(reservations.c.block)
+        )
+        with self._reading() as connection:
+            rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 2)
+        return rows[:, 0], rows[:, 1]
 
     def ids(self, sequences: Sequence[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
@@ -195,7 +209,9 @@ class Transaction:
     def __init__(self, connection: Connection, airspace: Airspace) -> None:
         self._connection = connection
         self._airspace = airspace
-        self._sequence, self.revision = connection.execute(select(counters.c.sequence, counters.c.revision)).one()
+        self._sequence, self.revision, self._longest_flight_ms = connection.execute(
+            select(counters.c.sequence, counters.c.revision, counters.c.longest_flight)
+        ).one()
 
     @contextmanager
     def savepoint(self) -> Iterator[None]:
@@ -207,17 +223,17 @@ class Transaction:
         LedgerUnavailable
             Any other failure of the database: the whole transaction is lost.
         """
-        before = self._sequence, self.revision
+        before = self._sequence, self.revision, self._longest_flight_ms
         try:
             with self._connection.begin_nested():
                 yield
         except IntegrityError as error:
-            self._sequence, self.revision = before
+            self._sequence, self.revision, self._longest_flight_ms = before
             raise ReservationOverlap(str(error.orig)) from error
         except DBAPIError as error:
             raise LedgerUnavailable(f"the ledger cannot be written: {error.orig}") from error
         except BaseException:
-            self._sequence, self.revision = before
+            self._sequence, self.revision, self._longest_flight_ms = before
             raise
 
     def record(
@@ -232,6 +248,9 @@ class Transaction:
     ) -> FlightIntent:
         """Insert an intent, accepted with its reservations or rejected, under the next sequence number."""
         state = State.REJECTED if trajectory is None else State.ACCEPTED
+        if trajectory is not None:
+            flight_ms = trajectory.arrival_ms - trajectory.departure_ms
+            self._longest_flight_ms = max(self._longest_flight_ms, flight_ms)
         self._advance(sequence=True)
         intent = FlightIntent(
             id=intent_id,
@@ -315,7 +334,11 @@ class Transaction:
     def _advance(self, *, sequence: bool) -> None:
         self._sequence += sequence
         self.revision += 1
-        self._connection.execute(update(counters).values(sequence=self._sequence, revision=self.revision))
+        self._connection.execute(
+            update(counters).values(
+                sequence=self._sequence, revision=self.revision, longest_flight=self._longest_flight_ms
+            )
+        )
 
     def _append(self, intent: FlightIntent, now_ms: int, kind: str, released: Reservations | None) -> None:
         self._connection.execute(
@@ -416,6 +439,16 @@ def _reservations(connection: Connection, airspace: Airspace, sequences: Sequenc
         )
         for sequence, start, end in zip(sequences, starts, ends, strict=True)
     }
+
+
+def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:
+    """Return the condition that a reservation belongs to a flight in the air within [from, to), for use with others."""
+    earliest = from_ms - select(counters.c.longest_flight).scalar_subquery()
+    return reservations.c.intent.in_(
+        select(flight_intents.c.sequence).where(
+            flight_intents.c.departure.between(earliest, to_ms), flight_intents.c.arrival >= from_ms
+        )
+    )
 
 
 def _held(rows: Sequence[Row[Any]]) -> HeldReservations:

@@ -19,6 +19,7 @@ counters = Table(
     Column("only", Integer, primary_key=True),
     Column("sequence", BigInteger),
     Column("revision", BigInteger),
+    Column("longest_flight", BigInteger),
 )
 
 # Times are ms since the epoch; `origin` and `destination` JSON objects of lon, lat, alt_m; `trajectory` a JSON list of

@@ -315,11 +315,8 @@ def read_occupancy(
     grid = service.airspace.grid
     start = service.clock() if from_ is None else from_
     from_ms, to_ms = _span(start, start + _DEFAULT_SPAN_MS if to is None else to)
-    held = service.ledger.held_between(from_ms, to_ms)
-    within_ms = np.minimum(held.exit_ms, to_ms) - np.maximum(held.enter_ms, from_ms)
-    block, place = np.unique(held.block, return_inverse=True)
-    seconds = np.bincount(place, weights=within_ms, minlength=len(block)) / 1000
-    indices = grid.ijk(block)
+    block, use_ms = service.ledger.use_between(from_ms, to_ms)
+    indices, seconds = grid.ijk(block), use_ms / 1000
     if layer is not None:
         _check_layer(service, layer)
         indices, seconds = indices[indices[:, 2] == layer], seconds[indices[:, 2] == layer]

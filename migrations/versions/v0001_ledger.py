@@ -42,8 +42,10 @@ def upgrade() -> None:
         sa.Column("only", sa.Integer, sa.CheckConstraint("only = 1", name="counters_only_one"), primary_key=True),
         sa.Column("sequence", sa.BigInteger, nullable=False),
         sa.Column("revision", sa.BigInteger, nullable=False),
+        # Bounds how long before a time a flight in the air at that time can have departed.
+        sa.Column("longest_flight", sa.BigInteger, nullable=False),
     )
-    op.execute("INSERT INTO counters VALUES (1, 0, 0)")
+    op.execute("INSERT INTO counters VALUES (1, 0, 0, 0)")
     op.create_table(
         "flight_intents",
         sa.Column("sequence", NUMBER, primary_key=True),
@@ -71,7 +73,7 @@ def upgrade() -> None:
         sa.UniqueConstraint("id", name="flight_intents_id"),
     )
     op.create_index("flight_intents_by_operator", "flight_intents", ["operator", "sequence"])
-    op.create_index("flight_intents_by_time", "flight_intents", ["arrival", "departure"])
+    op.create_index("flight_intents_by_time", "flight_intents", ["departure", "arrival"])
     op.create_table(
         "reservations",
         sa.Column("block", sa.BigInteger, primary_key=True),

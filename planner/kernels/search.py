@@ -176,11 +176,20 @@ def wait_for_sides(
 
 @kernel
 def first_start(
-    links: IntArray, table: IntArray, pool: IntArray, around: IntArray, p: int, link: int, tau: int, last: int
+    links: IntArray,
+    table: IntArray,
+    pool: IntArray,
+    around: IntArray,
+    p: int,
+    link: int,
+    stay: int,
+    tau: int,
+    last: int,
 ) -> tuple[int, int]:
     """Return the earliest start of a link in [tau, last] with all its holds free, and the neighbour's gap.
 
-    FAR_FUTURE if there is none. `look_around` must have been called for p at tau or earlier.
+    The neighbour must be free for `stay` ms more. FAR_FUTURE if there is no such start. `look_around` must have been
+    called for p at tau or earlier.
     """
     n = p + links[link, OFFSET]
     first, count = table[n, FIRST], table[n, COUNT]
@@ -193,7 +202,7 @@ def first_start(
             s = max(s, pool[first + g - 1, EXIT] - lead)
         if s > last:
             return FAR_FUTURE, g
-        if g < count and pool[first + g, ENTER] < s + duration:
+        if g < count and pool[first + g, ENTER] < s + duration + stay:
             g += 1
             continue
         free_from = wait_for_sides(links, table, pool, around, p, sides, s, duration)
@@ -313,6 +322,7 @@ def safe_interval(
             labels[label, CLOSED] = 1
             if can_end(labels, label, task):
                 return FOUND, label, expansions, disturbed
+            disturbed |= labels[label, BLOCK] == task.destination
             tau = labels[label, G]
         else:
             disturbed = True
@@ -332,7 +342,7 @@ def safe_interval(
                 disturbed = True
                 continue
             if links[link, BOX] & busy:
-                s, g = first_start(links, table, pool, around, p, link, tau, last)
+                s, g = first_start(links, table, pool, around, p, link, 0, tau, last)
                 if s != tau:
                     disturbed = True
                     if s == FAR_FUTURE:
@@ -411,8 +421,9 @@ def greedy(open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, ta
             if s > last:
                 disturbed = True
                 continue
-            if links[link, BOX] & busy:
-                s, g = first_start(links, table, pool, around, p, link, tau, last)
+            stay = task.dwell if n == task.destination else 0
+            if links[link, BOX] & busy or stay > 0:
+                s, g = first_start(links, table, pool, around, p, link, stay, tau, last)
                 if s != tau:
                     disturbed = True
                     if s == FAR_FUTURE:
@@ -421,9 +432,6 @@ def greedy(open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, ta
             if node >= 0 and arrival >= labels[node, G]:
                 continue
             start, end = gap_bounds(table, pool, n, g, task.earliest)
-            if n == task.destination and arrival + task.dwell + 1 > end:
-                disturbed = True
-                continue
             if node < 0:
                 node = count
                 h = heuristic(shape, near, n, task.destination)
@@ -519,7 +527,7 @@ def within_endurance(
             flown = labels[label, FLOWN] + links[link, TIME]
             tau = labels[label, G]
             while tau <= last and flown <= in_air:
-                s, g = first_start(links, table, pool, around, p, link, tau, last)
+                s, g = first_start(links, table, pool, around, p, link, 0, tau, last)
                 arrival = s + links[link, TIME]
                 if s == FAR_FUTURE or arrival - labels[label, DEPARTURE] > in_air:
                     break

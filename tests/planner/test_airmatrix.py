@@ -207,9 +207,3 @@ def test_geodetic_bounds_enclose_the_corners_of_all_cells() -> None:
     assert lon.shape == lat.shape == (5, 6)
     assert (west, east) == pytest.approx((lon.min(), lon.max()), abs=1e-9)
     assert (south, north) == pytest.approx((lat.min(), lat.max()), abs=1e-9)
-
-
-def test_column_centres_follow_the_flat_index_of_the_lowest_layer() -> None:
-    lon, lat = GRID.column_centres
-    assert lon.shape == (20,)
-    assert GRID.block_at(float(lon[7]), float(lat[7]), 0.0) == GRID.block(7) == (2, 1, 0)

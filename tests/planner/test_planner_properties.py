@@ -385,6 +385,24 @@ def test_waiting_stays_in_the_air_where_moving_it_would_make_a_conflict() -> Non
     ]
 
 
+@pytest.mark.parametrize(
+    ("rule", "left_until", "trajectory"),
+    [
+        (CONTAINMENT, 25, [(20, 20), (24, 30), (34, 34), (38, 38)]),
+        (MIDPOINT, 21, [(18, 18), (22, 28), (32, 32), (36, 36)]),
+    ],
+)
+def test_a_flight_finds_the_one_instant_at_which_it_can_go(
+    rule: OccupancyRule, left_until: int, trajectory: list[tuple[int, int]]
+) -> None:
+    city = drawn("AmnB", rule=rule)
+    planner = planner_in(
+        city.airspace, [Hold(city["A"], left_until, 60), Hold(city["m"], 12, 20), Hold(city["n"], 0, 30)]
+    )
+    plan = planner.plan(flight(city["A"], city["B"], latest=60))
+    assert trajectory_of(plan) == [Visit(city[sign], *times) for sign, times in zip("AmnB", trajectory, strict=True)]
+
+
 def test_head_on_in_a_corridor_the_second_flight_departs_when_the_first_has_landed() -> None:
     city = drawn("A..B")
     one, other = plans_in_order(
@@ -432,6 +450,19 @@ def test_a_landing_whose_dwell_just_fits_does_not_wait(search: Search) -> None:
     plan = planner.plan(flight(city["A"], city["B"], latest=60))
     assert trajectory_of(plan) == [Visit(city["A"], 0, 5), Visit(city["B"], 9, 14)]
     assert holds_in(plan) == [Hold(city["A"], 0, 10), Hold(city["B"], 5, 15)]
+
+
+def test_a_flight_turned_away_from_its_landing_comes_back_and_that_is_delay() -> None:
+    city = drawn("AB", rule=MIDPOINT, terminal_dwell_ms=3)
+    planner = planner_in(city.airspace, [Hold(city["A"], 6, 8), Hold(city["B"], 10, 11)])
+    plan = planner.plan(flight(city["A"], city["B"]))
+    assert trajectory_of(plan) == [
+        Visit(city["A"], 0, 3),
+        Visit(city["B"], 7, 7),
+        Visit(city["A"], 11, 11),
+        Visit(city["B"], 15, 18),
+    ]
+    assert (plan.flight_time_ms, plan.delay_ms) == (18, 8)
 
 
 # The paper's search and ours

@@ -199,18 +199,30 @@ def test_a_plans_figures_follow_from_its_trajectory(search: Search, situation: S
 @pytest.mark.parametrize("search", Search)
 @given(situation=situations())
 @unhurried
-def test_without_traffic_both_searches_are_a_star(search: Search, situation: Situation) -> None:
-    empty = Situation(situation.airspace, (), situation.request)
-    expected = flight_time_without_traffic(situation.airspace, situation.request)
-    plan = planned(empty, search)
-    if expected is None:
-        assert plan is None
+def test_without_traffic_both_searches_are_a_star_with_the_same_order_among_equals(
+    search: Search, situation: Situation
+) -> None:
+    airspace, request = situation.airspace, situation.request
+    plan = planned(Situation(airspace, (), request), search)
+    if plan is None:
+        assert flight_time_without_traffic(airspace, request) is None
     else:
-        assert plan is not None
-        assert plan.flight_time_ms == expected
+        assert plan.flight_time_ms == flight_time_without_traffic(airspace, request)
         assert plan.delay_ms == plan.ground_hold_ms == plan.hover_ms == 0
-        busy = planner_in(situation.airspace, situation.reservations, search)
-        assert busy.unconstrained(situation.request) == expected
+        assert trajectory_of(plan) == greedy_path(airspace, (), request, hover_limit_ms=0)
+
+
+@pytest.mark.parametrize("search", Search)
+@given(situation=situations())
+@unhurried
+def test_the_flight_time_without_traffic_does_not_depend_on_the_traffic(search: Search, situation: Situation) -> None:
+    planner = planner_in(situation.airspace, situation.reservations, search)
+    expected = flight_time_without_traffic(situation.airspace, situation.request)
+    if expected is None:
+        with pytest.raises(Disconnected):
+            planner.unconstrained(situation.request)
+    else:
+        assert planner.unconstrained(situation.request) == expected
 
 
 @given(st.one_of(situations(), situations_with_endurance()))

@@ -171,34 +171,32 @@ def reservations_in(draw: st.DrawFn, airspace: Airspace) -> tuple[Hold, ...]:
 
 @st.composite
 def situations(draw: st.DrawFn) -> Situation:
-    """Draw a flight in traffic, under either rule; often nothing else is ever in its first or its last block."""
+    """Draw a flight in traffic, under either rule.
+
+    Half of the flights have to leave their first block early, or else much later, and cannot have the last one before
+    some time: they wait somewhere in between. Of the others, often nobody else is ever in the first or the last block.
+    """
     airspace = draw(airspaces(EITHER_RULE))
     request = draw(requests_in(airspace))
-    quiet = draw(st.sets(st.sampled_from([request.origin, request.destination])))
-    reservations = tuple(hold for hold in draw(reservations_in(airspace)) if hold.block not in quiet)
-    return Situation(airspace, reservations, request)
+    origin, destination = request.origin, request.destination
+    reservations = draw(reservations_in(airspace))
+    if draw(st.booleans()):
+        request = replace(request, latest_departure_ms=request.earliest_departure_ms + draw(st.integers(0, 60)))
+        leave = request.earliest_departure_ms + airspace.terminal_dwell_ms + draw(st.integers(3, 12))
+        at_the_ends = (
+            Hold(origin, leave, leave + draw(st.integers(4, 40))),
+            Hold(destination, 0, leave + draw(st.integers(0, 50))),
+        )
+        elsewhere = tuple(hold for hold in reservations if hold.block not in (origin, destination))
+        return Situation(airspace, at_the_ends + elsewhere, request)
+    quiet = draw(st.sets(st.sampled_from([origin, destination])))
+    return Situation(airspace, tuple(hold for hold in reservations if hold.block not in quiet), request)
 
 
 @st.composite
 def situations_with_endurance(draw: st.DrawFn) -> Situation:
-    """Draw a flight in traffic with about the endurance that it needs without traffic.
-
-    Often the window has an early departure slot, from which the flight waits for the last block, and a late one.
-    """
+    """Draw a flight in traffic with about the endurance that it needs without traffic."""
     situation = draw(situations())
-    request = situation.request
-    needed_ms = flight_time_without_traffic(situation.airspace, request) or 2
-    if draw(st.booleans()):
-        request = replace(request, latest_departure_ms=request.earliest_departure_ms + draw(st.integers(0, 60)))
-        slot_end = request.earliest_departure_ms + situation.airspace.terminal_dwell_ms + draw(st.integers(3, 12))
-        elsewhere = [hold for hold in situation.reservations if hold.block not in (request.origin, request.destination)]
-        situation = replace(
-            situation,
-            reservations=(
-                *elsewhere,
-                Hold(request.origin, slot_end, slot_end + draw(st.integers(4, 40))),
-                Hold(request.destination, 0, slot_end + draw(st.integers(0, 50))),
-            ),
-        )
+    needed_ms = flight_time_without_traffic(situation.airspace, situation.request) or 2
     endurance_ms = needed_ms + draw(st.one_of(st.integers(-2, 4), st.integers(0, 20)))
-    return replace(situation, request=_with_endurance(request, endurance_ms))
+    return replace(situation, request=_with_endurance(situation.request, endurance_ms))
