@@ -6,7 +6,7 @@ Without telemetry nothing is known of deviations, so every reserved block is gre
 from dataclasses import dataclass
 from enum import StrEnum
 
-from app.ledger.ledger import HeldReservations
+from app.ledger.rows import HeldReservations
 
 
 class Status(StrEnum):

@@ -17,13 +17,14 @@ from planner.errors import (
     OriginBlocked,
     SameBlock,
 )
+from planner.kernels import labels as label_columns
 from planner.kernels import path as path_kernels
 from planner.kernels import search as search_kernels
 from planner.kernels.connectivity import label_components
-from planner.kernels.heap import BLOCK, GAP_END
-from planner.kernels.heap import G as LABEL_G
+from planner.kernels.endurance import within_endurance
 from planner.kernels.intervals import Slabs, empty_slabs
-from planner.kernels.search import Motion, Task
+from planner.kernels.labels import Task, new_workspace
+from planner.kernels.motion import Motion
 from planner.links import LinkTimes, build_link_times, build_offsets
 from planner.occupancy import OccupancyIndex, build_motion, open_links
 from planner.path import Plan
@@ -83,7 +84,7 @@ class Planner:
         self._offsets = build_offsets(airspace.grid)
         self._components = label_components(self._open_links, self._offsets)
         self._empty = empty_slabs(airspace.grid.block_count, pool_size=1)
-        self._workspace = search_kernels.new_workspace(airspace.grid.block_count, _INITIAL_LABELS)
+        self._workspace = new_workspace(airspace.grid.block_count, _INITIAL_LABELS)
         self._stamp = 0
         self._motions: dict[tuple[int, ...], Motion] = {}
 
@@ -154,7 +155,7 @@ class Planner:
         if endurance is None or plan.flight_time_ms <= endurance:
             return plan
         if self.search is Search.SAFE_INTERVAL:
-            status, label, further, _ = self._run(search_kernels.within_endurance, motion, slabs, task, endurance)
+            status, label, further, _ = self._run(within_endurance, motion, slabs, task, endurance)
             if status == search_kernels.FOUND:
                 return self._plan(motion, task, label, expansions + further, disturbed=True)
         return EnduranceExceeded(
@@ -165,10 +166,12 @@ class Planner:
         """Return the owners of the reservations that shut in a search without a path, in the order it met them."""
         owners: dict[int, None] = {}
         for label in self._workspace.labels[: min(labels, _SHUT_IN_LABELS)]:
-            block, open_links = label[BLOCK], self._open_links[label[BLOCK]]
+            block, open_links = label[label_columns.BLOCK], self._open_links[label[label_columns.BLOCK]]
             near = [block, *(block + offset for link, offset in enumerate(self._offsets) if open_links >> link & 1)]
             for place in near:
-                owners.update(dict.fromkeys(self.index.owners(place, label[LABEL_G], label[GAP_END] + 1)))
+                owners.update(
+                    dict.fromkeys(self.index.owners(place, label[label_columns.G], label[label_columns.GAP_END] + 1))
+                )
         return tuple(owners)
 
     def _run(
@@ -185,7 +188,7 @@ class Planner:
             outcome = kernel(self._open_links, motion, slabs, self._workspace, stamped, *rest)
             if outcome[0] != search_kernels.WORKSPACE_FULL:
                 return outcome
-            self._workspace = search_kernels.new_workspace(len(self._components), 2 * len(self._workspace.labels))
+            self._workspace = new_workspace(len(self._components), 2 * len(self._workspace.labels))
 
     def _next_stamp(self) -> int:
         self._stamp += 1
@@ -217,7 +220,7 @@ class Planner:
 
     def _unconstrained(self, motion: Motion, task: Task) -> int:
         _, goal, _, _ = self._run(search_kernels.greedy, motion, self._empty, task)
-        return int(self._workspace.labels[goal, LABEL_G]) + task.dwell - task.earliest
+        return int(self._workspace.labels[goal, label_columns.G]) + task.dwell - task.earliest
 
     def _motion(self, performance: Performance) -> Motion:
         key = performance.times[1:]

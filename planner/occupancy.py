@@ -8,7 +8,7 @@ from planner.errors import AircraftProfileError, Block
 from planner.heuristic import lattice_distance
 from planner.kernels import intervals
 from planner.kernels.heap import MAX_H
-from planner.kernels.search import BOX, LEAD, OFFSET, TAIL, TIME, Motion, Shape
+from planner.kernels.motion import BOX, LEAD, OFFSET, TAIL, TIME, Motion, Shape
 from planner.links import DIRECTIONS, LINK_COUNT, LinkTimes, box_steps, build_offsets
 
 _LINK_OF = {direction: link for link, direction in enumerate(DIRECTIONS)}

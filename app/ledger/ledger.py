@@ -7,16 +7,15 @@ sees everything committed before it, so `sequence` and `revision` are gapless an
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
-import orjson
-from sqlalchemy import ColumnElement, Connection, Engine, Row, and_, case, delete, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Engine, and_, case, delete, func, insert, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.errors import LedgerUnavailable
-from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
+from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission, Trajectory
+from app.ledger.rows import HeldReservations, columns_of, dump_columns, to_held, to_intent, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
@@ -49,16 +48,6 @@ class IdempotencyRecord:
     body_digest: str
     intent: FlightIntent
     answer: bytes
-
-
-@dataclass(frozen=True, eq=False)
-class HeldReservations:
-    """Reservations as columns, with the sequence number of the intent that holds each."""
-
-    block: IntArray
-    enter_ms: IntArray
-    exit_ms: IntArray
-    sequence: IntArray
 
 
 class Ledger:
@@ -152,7 +141,7 @@ class Ledger:
         with self._reading() as connection:
             rows = connection.execute(query).all()
             held = _reservations(connection, self._airspace, [row.sequence for row in rows])
-        return [_intent(row, self._airspace, held[row.sequence]) for row in rows]
+        return [to_intent(row, self._airspace, held[row.sequence]) for row in rows]
 
     def all_intents(self, batch: int = 500) -> Iterator[FlightIntent]:
         """Yield every intent by sequence."""
@@ -175,7 +164,7 @@ class Ledger:
             query = query.where(reservations.c.block == block)
         with self._reading() as connection:
             rows = connection.execute(query.order_by(reservations.c.block, reservations.c.enter)).all()
-        return _held(rows)
+        return to_held(rows)
 
     def use_between(self, from_ms: int, to_ms: int) -> tuple[IntArray, IntArray]:
         """Return the blocks reserved within [from, to), and for how many ms of it: two arrays (n,)."""
@@ -263,7 +252,7 @@ class Transaction:
             reservations=reservations or Reservations.none(),
             refusal=refusal,
         )
-        self._connection.execute(insert(flight_intents), _row(intent))
+        self._connection.execute(insert(flight_intents), to_row(intent))
         self._reserve(intent.sequence, intent.reservations)
         self._append(intent, now_ms, state.value, released=None)
         return intent
@@ -300,7 +289,7 @@ class Transaction:
         query = select(reservations).where(reservations.c.exit > time_ms)
         if sequences is not None:
             query = query.where(reservations.c.intent.in_(sequences))
-        return _held(self._connection.execute(query.order_by(reservations.c.intent)).all())
+        return to_held(self._connection.execute(query.order_by(reservations.c.intent)).all())
 
     def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
         """Return the first answer to an idempotency key, None if it is new."""
@@ -347,88 +336,31 @@ class Transaction:
                 time=now_ms,
                 kind=kind,
                 intent=intent.sequence,
-                released=None if released is None else _dump_columns(*_columns(released)),
+                released=None if released is None else dump_columns(*columns_of(released)),
             )
         )
 
     def _reserve(self, sequence: int, held: Reservations) -> None:
         """Insert reservations: the only place that does. By driver, since a hundred rows an intent are the hot path."""
         if len(held):
-            block, enter, leave = (column.tolist() for column in _columns(held))
+            block, enter, leave = (column.tolist() for column in columns_of(held))
             rows = list(zip(block, enter, leave, [sequence] * len(block), strict=True))
             self._connection.exec_driver_sql(
                 'INSERT INTO reservations (block, enter, "exit", intent) VALUES (?, ?, ?, ?)', rows
             )
 
 
-def _row(intent: FlightIntent) -> dict[str, object]:
-    submission, trajectory = intent.submission, intent.trajectory
-    return {
-        "sequence": intent.sequence,
-        "id": intent.id,
-        "version": intent.version,
-        "state": intent.state.value,
-        "operator": submission.operator,
-        "reference": submission.reference,
-        "aircraft_type": submission.aircraft_type,
-        "priority": submission.priority,
-        "origin": json.dumps(asdict(submission.origin)),
-        "destination": json.dumps(asdict(submission.destination)),
-        "origin_block": submission.origin_block,
-        "destination_block": submission.destination_block,
-        "earliest_departure": submission.earliest_departure_ms,
-        "latest_departure": submission.latest_departure_ms,
-        "received": intent.received_ms,
-        "departure": None if trajectory is None else trajectory.departure_ms,
-        "arrival": None if trajectory is None else trajectory.arrival_ms,
-        "unconstrained": None if trajectory is None else trajectory.unconstrained_ms,
-        "trajectory": None if trajectory is None else _dump_trajectory(trajectory),
-        "refusal": None if intent.refusal is None else json.dumps(asdict(intent.refusal)),
-    }
-
-
-def _intent(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIntent:
-    trajectory = refusal = None
-    if row.trajectory is not None:
-        trajectory = _load_trajectory(row.trajectory, row.unconstrained, airspace.terminal_dwell_ms)
-    if row.refusal is not None:
-        parts = json.loads(row.refusal)
-        refusal = Refusal(**{**parts, "conflicting_intents": tuple(parts["conflicting_intents"])})
-    return FlightIntent(
-        id=row.id,
-        sequence=row.sequence,
-        version=row.version,
-        state=State(row.state),
-        submission=Submission(
-            operator=row.operator,
-            reference=row.reference,
-            aircraft_type=row.aircraft_type,
-            priority=row.priority,
-            origin=Position(**json.loads(row.origin)),
-            destination=Position(**json.loads(row.destination)),
-            origin_block=row.origin_block,
-            destination_block=row.destination_block,
-            earliest_departure_ms=row.earliest_departure,
-            latest_departure_ms=row.latest_departure,
-        ),
-        received_ms=row.received,
-        trajectory=trajectory,
-        reservations=held,
-        refusal=refusal,
-    )
-
-
 def _find(connection: Connection, airspace: Airspace, intent_id: str) -> FlightIntent | None:
     row = connection.execute(select(flight_intents).where(flight_intents.c.id == intent_id)).one_or_none()
     if row is None:
         return None
-    return _intent(row, airspace, _reservations(connection, airspace, [row.sequence])[row.sequence])
+    return to_intent(row, airspace, _reservations(connection, airspace, [row.sequence])[row.sequence])
 
 
 def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:
     """Return the reservations of some intents, each sorted by enter, then i, j, k."""
     query = select(reservations).where(reservations.c.intent.in_(sequences))
-    held = _held(connection.execute(query).all())
+    held = to_held(connection.execute(query).all())
     i, j, k = airspace.grid.ijk(held.block).T
     order = np.lexsort((k, j, i, held.enter_ms, held.sequence))
     ends = np.searchsorted(held.sequence[order], sequences, side="right")
@@ -449,11 +381,6 @@ def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:
             flight_intents.c.departure.between(earliest, to_ms), flight_intents.c.arrival >= from_ms
         )
     )
-
-
-def _held(rows: Sequence[Row[Any]]) -> HeldReservations:
-    columns = np.array([tuple(row) for row in rows], dtype=np.int64).reshape(-1, 4)
-    return HeldReservations(columns[:, 0], columns[:, 1], columns[:, 2], columns[:, 3])
 
 
 def _ids(connection: Connection, sequences: Sequence[int]) -> dict[int, str]:
@@ -480,20 +407,3 @@ def _journal_after(connection: Connection, revision: int, limit: int | None) -> 
         )
         for row in connection.execute(query)
     ]
-
-
-def _columns(held: Reservations) -> tuple[IntArray, IntArray, IntArray]:
-    return held.block, held.enter_ms, held.exit_ms
-
-
-def _dump_columns(*columns: IntArray) -> str:
-    return orjson.dumps(np.column_stack(columns), option=orjson.OPT_SERIALIZE_NUMPY).decode()
-
-
-def _dump_trajectory(trajectory: Trajectory) -> str:
-    return _dump_columns(trajectory.block, trajectory.arrive_ms, trajectory.depart_ms)
-
-
-def _load_trajectory(text: str, unconstrained_ms: int, terminal_dwell_ms: int) -> Trajectory:
-    block, arrive, depart = np.array(orjson.loads(text), dtype=np.int64).T.copy()
-    return Trajectory(block, arrive, depart, unconstrained_ms, terminal_dwell_ms)

@@ -5,6 +5,7 @@ block index, then by the start of the free interval: by what a label is, never b
 """
 
 from planner.airmatrix import IntArray
+from planner.kernels.labels import BLOCK, GAP_START
 from planner.kernels.policy import kernel
 
 H_BITS = 30
@@ -13,10 +14,6 @@ MAX_F = (1 << (62 - H_BITS)) - 1
 
 # Columns of the heap (a row an entry). An item is a label, or ~label for one to be resumed.
 KEY, ITEM = range(2)
-
-# Columns of labels (a row a label), see `planner.kernels.search`.
-G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, CLOSED, RESUME, DEPARTURE, FLOWN = range(13)
-LABEL_COLUMNS = 13
 
 
 @kernel

@@ -3,10 +3,10 @@
 import numpy as np
 
 from planner.airmatrix import IntArray
-from planner.kernels.heap import BLOCK, GAP_END, PARENT, START, G
 from planner.kernels.intervals import COUNT, ENTER, FIRST, Slabs, ended_by
+from planner.kernels.labels import BLOCK, GAP_END, HEAD, PARENT, STAMP, START, G, Task
+from planner.kernels.motion import BOX, LEAD, OFFSET, TAIL, TIME, Motion, Shape
 from planner.kernels.policy import kernel
-from planner.kernels.search import BOX, HEAD, LEAD, OFFSET, STAMP, TAIL, TIME, Motion, Shape, Task
 
 
 @kernel

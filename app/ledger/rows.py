@@ -1,0 +1,108 @@
+"""Between the ledger's rows and flight intents."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+from sqlalchemy import Row
+
+from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
+from planner.airmatrix import IntArray
+from planner.airspace import Airspace
+
+
+@dataclass(frozen=True, eq=False)
+class HeldReservations:
+    """Reservations as columns, with the sequence number of the intent that holds each."""
+
+    block: IntArray
+    enter_ms: IntArray
+    exit_ms: IntArray
+    sequence: IntArray
+
+
+def to_row(intent: FlightIntent) -> dict[str, object]:
+    """Return an intent as a row of `flight_intents`."""
+    submission, trajectory = intent.submission, intent.trajectory
+    return {
+        "sequence": intent.sequence,
+        "id": intent.id,
+        "version": intent.version,
+        "state": intent.state.value,
+        "operator": submission.operator,
+        "reference": submission.reference,
+        "aircraft_type": submission.aircraft_type,
+        "priority": submission.priority,
+        "origin": json.dumps(asdict(submission.origin)),
+        "destination": json.dumps(asdict(submission.destination)),
+        "origin_block": submission.origin_block,
+        "destination_block": submission.destination_block,
+        "earliest_departure": submission.earliest_departure_ms,
+        "latest_departure": submission.latest_departure_ms,
+        "received": intent.received_ms,
+        "departure": None if trajectory is None else trajectory.departure_ms,
+        "arrival": None if trajectory is None else trajectory.arrival_ms,
+        "unconstrained": None if trajectory is None else trajectory.unconstrained_ms,
+        "trajectory": None if trajectory is None else _dump_trajectory(trajectory),
+        "refusal": None if intent.refusal is None else json.dumps(asdict(intent.refusal)),
+    }
+
+
+def to_intent(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIntent:
+    """Return a row of `flight_intents` as an intent with these reservations."""
+    trajectory = refusal = None
+    if row.trajectory is not None:
+        trajectory = _load_trajectory(row.trajectory, row.unconstrained, airspace.terminal_dwell_ms)
+    if row.refusal is not None:
+        parts = json.loads(row.refusal)
+        refusal = Refusal(**{**parts, "conflicting_intents": tuple(parts["conflicting_intents"])})
+    return FlightIntent(
+        id=row.id,
+        sequence=row.sequence,
+        version=row.version,
+        state=State(row.state),
+        submission=Submission(
+            operator=row.operator,
+            reference=row.reference,
+            aircraft_type=row.aircraft_type,
+            priority=row.priority,
+            origin=Position(**json.loads(row.origin)),
+            destination=Position(**json.loads(row.destination)),
+            origin_block=row.origin_block,
+            destination_block=row.destination_block,
+            earliest_departure_ms=row.earliest_departure,
+            latest_departure_ms=row.latest_departure,
+        ),
+        received_ms=row.received,
+        trajectory=trajectory,
+        reservations=held,
+        refusal=refusal,
+    )
+
+
+def to_held(rows: Sequence[Row[Any]]) -> HeldReservations:
+    """Return rows of `reservations` as columns."""
+    columns = np.array([tuple(row) for row in rows], dtype=np.int64).reshape(-1, 4)
+    return HeldReservations(columns[:, 0], columns[:, 1], columns[:, 2], columns[:, 3])
+
+
+def columns_of(held: Reservations) -> tuple[IntArray, IntArray, IntArray]:
+    """Return block, enter and exit."""
+    return held.block, held.enter_ms, held.exit_ms
+
+
+def dump_columns(*columns: IntArray) -> str:
+    """Return columns as a JSON list of rows."""
+    return orjson.dumps(np.column_stack(columns), option=orjson.OPT_SERIALIZE_NUMPY).decode()
+
+
+def _dump_trajectory(trajectory: Trajectory) -> str:
+    return dump_columns(trajectory.block, trajectory.arrive_ms, trajectory.depart_ms)
+
+
+def _load_trajectory(text: str, unconstrained_ms: int, terminal_dwell_ms: int) -> Trajectory:
+    block, arrive, depart = np.array(orjson.loads(text), dtype=np.int64).T.copy()
+    return Trajectory(block, arrive, depart, unconstrained_ms, terminal_dwell_ms)

@@ -1,0 +1,130 @@
+"""The search within the endurance, for when the earliest arrival of all takes longer (docs/decisions/0005)."""
+
+from planner.airmatrix import IntArray
+from planner.kernels.heap import pop
+from planner.kernels.intervals import COUNT, ENTER, FAR_FUTURE, FIRST, Slabs, ended_by
+from planner.kernels.labels import (
+    BLOCK,
+    DEPARTURE,
+    FLOWN,
+    FOLLOWING,
+    GAP,
+    GAP_END,
+    HEAD,
+    PARENT,
+    STAMP,
+    START,
+    G,
+    Task,
+    Workspace,
+    add_label,
+    can_end,
+    gap_bounds,
+)
+from planner.kernels.motion import BOX, OFFSET, TAIL, TIME, Motion, first_start, heuristic, look_around
+from planner.kernels.policy import kernel
+from planner.kernels.search import FOUND, NO_PATH, WORKSPACE_FULL, open_departures, open_label
+
+
+@kernel
+def window_end(links: IntArray, table: IntArray, pool: IntArray, p: int, link: int, g: int, s: int, last: int) -> int:
+    """Return the last start up to which all starts from the feasible start s on are feasible too."""
+    duration = links[link, TIME] + 1
+    n = p + links[link, OFFSET]
+    if g < table[n, COUNT]:
+        last = min(last, pool[table[n, FIRST] + g, ENTER] - duration)
+    sides = links[link, BOX] & ~(1 << link)
+    for side in range(26):
+        if (sides >> side) & 1:
+            block = p + links[side, OFFSET]
+            ended = ended_by(table, pool, block, s)
+            if ended < table[block, COUNT]:
+                last = min(last, pool[table[block, FIRST] + ended, ENTER] - duration)
+    return last
+
+
+@kernel
+def is_dominated(
+    marks: IntArray,
+    labels: IntArray,
+    stamp: int,
+    block: int,
+    gap: int,
+    arrival: int,
+    departure: int,
+    flown: int,
+) -> bool:
+    """Tell whether some label of the gap arrives no later, may depart no earlier and has flown no longer."""
+    label = marks[block, HEAD] if marks[block, STAMP] == stamp else -1
+    while label >= 0:
+        if (
+            labels[label, GAP] == gap
+            and labels[label, G] <= arrival
+            and labels[label, DEPARTURE] >= departure
+            and labels[label, FLOWN] <= flown
+        ):
+            return True
+        label = labels[label, FOLLOWING]
+    return False
+
+
+@kernel
+def within_endurance(
+    open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, task: Task, endurance: int
+) -> tuple[int, int, int, bool]:
+    """The earliest arrival with arrival - departure within `endurance`, for when the earliest of all takes longer.
+
+    A label is a set of departures: leaving at D up to `departure` arrives at max(G, D + `flown`). Every window of
+    feasible starts of a link makes one; the time in the air at arrival G is max(`flown`, G - `departure`), which no
+    later arrival of the same label undercuts. Returns as `safe_interval` does.
+    """
+    shape, links, near = motion
+    table, pool, _ = slabs
+    marks, labels, heap, around = ws
+    count = open_departures(shape, near, table, pool, marks, labels, task)
+    size = 0
+    for label in range(count):
+        labels[label, DEPARTURE] = min(task.latest, labels[label, GAP_END] - 1 - task.dwell)
+        labels[label, FLOWN] = task.dwell
+        size = open_label(heap, size, labels, label, task.earliest)
+    expansions = 0
+    while size > 0:
+        label = pop(heap, size, labels)
+        size -= 1
+        if can_end(labels, label, task):
+            return FOUND, label, expansions, True
+        expansions += 1
+        p = labels[label, BLOCK]
+        look_around(open_links, links, table, pool, around, p, labels[label, G], shape.reach)
+        for link in range(26):
+            if not (open_links[p] >> link) & 1:
+                continue
+            last = labels[label, GAP_END] - 1 - links[link, TAIL]
+            n = p + links[link, OFFSET]
+            h = heuristic(shape, near, n, task.destination)
+            in_air = endurance - task.dwell - h
+            flown = labels[label, FLOWN] + links[link, TIME]
+            tau = labels[label, G]
+            while tau <= last and flown <= in_air:
+                s, g = first_start(links, table, pool, around, p, link, 0, tau, last)
+                arrival = s + links[link, TIME]
+                if s == FAR_FUTURE or arrival - labels[label, DEPARTURE] > in_air:
+                    break
+                until = window_end(links, table, pool, p, link, g, s, last)
+                departure = min(labels[label, DEPARTURE], until - labels[label, FLOWN])
+                if arrival - departure <= in_air and not is_dominated(
+                    marks, labels, task.stamp, n, g, arrival, departure, flown
+                ):
+                    if count == labels.shape[0] or size == heap.shape[0]:
+                        return WORKSPACE_FULL, -1, expansions, True
+                    start, end = gap_bounds(table, pool, n, g, task.earliest)
+                    add_label(marks, labels, task.stamp, count, n, g, start, end, h)
+                    labels[count, G] = arrival
+                    labels[count, DEPARTURE] = departure
+                    labels[count, FLOWN] = flown
+                    labels[count, PARENT] = label
+                    labels[count, START] = s
+                    size = open_label(heap, size, labels, count, task.earliest)
+                    count += 1
+                tau = until + 1
+    return NO_PATH, count, expansions, True

@@ -1,0 +1,111 @@
+"""Labels: arrivals at block centres, and what they are kept in.
+
+A label is an arrival at a block's centre: G its time, H the heuristic, F = G + H. Its free interval is a gap between
+reservations of the block.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from planner.airmatrix import IntArray
+from planner.kernels.intervals import COUNT, ENTER, EXIT, FAR_FUTURE, FIRST
+from planner.kernels.policy import kernel
+
+# Columns of `Workspace.labels`, a row a label.
+G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, CLOSED, RESUME, DEPARTURE, FLOWN = range(13)
+LABEL_COLUMNS = 13
+
+# Columns of `Workspace.marks`, a row a block: the search that last touched it, and its first label there.
+STAMP, HEAD = range(2)
+
+
+class Task(NamedTuple):
+    """One request: blocks, departure window, terminal dwell, the greedy search's hover limit, in ms; its stamp."""
+
+    origin: int
+    destination: int
+    earliest: int
+    latest: int
+    dwell: int
+    hover_limit: int
+    stamp: int
+
+
+class Workspace(NamedTuple):
+    """Memory that searches share, one at a time; stamps say what belongs to the present search.
+
+    `labels` (n, 13) by the columns above: G, H, block, gap number and bounds, parent label, the
+    start of the link from it, the block's `following` label, `closed`, `resume` (see `safe_interval`), `departure`
+    and `flown` (see `within_endurance`). `around` (26,): the gap number at each neighbour of the block expanded.
+    """
+
+    marks: IntArray
+    labels: IntArray
+    heap: IntArray
+    around: IntArray
+
+
+def new_workspace(block_count: int, label_count: int) -> Workspace:
+    """Return memory for searches of up to `label_count` labels."""
+    return Workspace(
+        marks=np.zeros((block_count, 2), dtype=np.int64),
+        labels=np.empty((label_count, LABEL_COLUMNS), dtype=np.int64),
+        heap=np.empty((4 * label_count, 2), dtype=np.int64),
+        around=np.zeros(26, dtype=np.int64),
+    )
+
+
+@kernel
+def gap_bounds(table: IntArray, pool: IntArray, block: int, gap: int, earliest: int) -> tuple[int, int]:
+    """Return a gap's start and end; starts before `earliest` are that, so that forgetting the past changes nothing."""
+    first = table[block, FIRST]
+    start, end = earliest, FAR_FUTURE
+    if gap > 0:
+        start = max(start, pool[first + gap - 1, EXIT])
+    if gap < table[block, COUNT]:
+        end = pool[first + gap, ENTER]
+    return start, end
+
+
+@kernel
+def label_for(marks: IntArray, labels: IntArray, stamp: int, block: int, gap: int) -> int:
+    """Return the label of a gap in this search, -1 if it has none yet."""
+    if marks[block, STAMP] != stamp:
+        return -1
+    label = marks[block, HEAD]
+    while label >= 0 and labels[label, GAP] != gap:
+        label = labels[label, FOLLOWING]
+    return label
+
+
+@kernel
+def add_label(
+    marks: IntArray,
+    labels: IntArray,
+    stamp: int,
+    label: int,
+    block: int,
+    gap: int,
+    start: int,
+    end: int,
+    h: int,
+) -> None:
+    """Set up an unused label as the head of its block's list."""
+    labels[label, BLOCK] = block
+    labels[label, GAP] = gap
+    labels[label, GAP_START] = start
+    labels[label, GAP_END] = end
+    labels[label, H] = h
+    labels[label, CLOSED] = 0
+    labels[label, FOLLOWING] = marks[block, HEAD] if marks[block, STAMP] == stamp else -1
+    marks[block, STAMP] = stamp
+    marks[block, HEAD] = label
+
+
+@kernel
+def can_end(labels: IntArray, label: int, task: Task) -> bool:
+    """Tell whether a label is an arrival: at the destination, with time for the dwell."""
+    return bool(
+        labels[label, BLOCK] == task.destination and labels[label, G] + task.dwell + 1 <= labels[label, GAP_END]
+    )
