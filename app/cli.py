@@ -59,6 +59,7 @@ def serve(
     ledger: Annotated[str | None, typer.Option(help="Ledger file or URL, created if absent.")] = None,
     airspace: Annotated[Path | None, typer.Option(help="Airspace file. Default: the shipped one.")] = None,
     aircraft_types: Annotated[Path | None, typer.Option(help="TOML file of further aircraft types.")] = None,
+    workers: Annotated[int, typer.Option(min=1, max=1, help="Processes; this version runs one.")] = 1,  # noqa: ARG001
 ) -> None:
     """Serve the API. Every option, and every other setting, is also an AIRMATRIX_* variable."""
     settings = Settings.given(host=host, port=port, ledger=ledger, airspace=airspace, aircraft_types=aircraft_types)

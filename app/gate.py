@@ -4,7 +4,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app import auth, problems
-from app.errors import BodyTooLarge, HostNotAllowed, RequestError
+from app.errors import BodyTooLarge, HostNotAllowed, MalformedRequest, RequestError
 from app.settings import Settings
 
 
@@ -50,6 +50,8 @@ class Gate:
         more = True
         while more and max(size, received) <= limit:
             message = await receive()
+            if message["type"] == "http.disconnect":
+                raise MalformedRequest("the connection ended within the body")
             chunk = message.get("body", b"")
             received += len(chunk)
             chunks.append(chunk)

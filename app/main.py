@@ -8,6 +8,7 @@ from typing import Any, TypedDict
 from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from fastapi_offline import FastAPIOffline
 from starlette.responses import RedirectResponse
 
 from app import problems, service
@@ -43,7 +44,14 @@ def create_app(settings: Settings, clock: Callable[[], int] = now_ms, *, running
         yield {"service": await to_thread.run_sync(starting.__enter__)}
         await to_thread.run_sync(starting.__exit__, None, None, None)
 
-    app = FastAPI(title="AirMatrix", version=version("airmatrix"), description=DESCRIPTION, lifespan=lifespan)
+    # Its documentation page needs no other server than this one.
+    app = FastAPIOffline(
+        title="AirMatrix",
+        version=version("airmatrix"),
+        description=DESCRIPTION,
+        lifespan=lifespan,
+        redoc_url=None,
+    )
     for resource in (flight_intents, aircraft_types, airspace, events, health):
         app.include_router(resource.router)
     app.include_router(problems.router)
