@@ -17,10 +17,10 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 _config = cast(Any, numba).config
 
 
-def cache_folder() -> Path:
-    """Return the folder for machine code compiled from these very sources with this numba and these flags."""
+def cache_folder(boundscheck: object) -> Path:
+    """Return the folder for machine code compiled from these very sources with this numba and this flag."""
     here = Path(__file__).parent
-    digest = hashlib.sha256(f"{numba.__version__} boundscheck={_config.BOUNDSCHECK}".encode())
+    digest = hashlib.sha256(f"{numba.__version__} boundscheck={boundscheck}".encode())
     for source in sorted(here.glob("*.py")):
         digest.update(source.read_bytes())
     if _config.CACHE_DIR:
@@ -32,7 +32,7 @@ def cache_folder() -> Path:
     return root / digest.hexdigest()[:16]
 
 
-_CACHE_FOLDER = cache_folder()
+_CACHE_FOLDER = cache_folder(_config.BOUNDSCHECK)
 
 
 def is_compiled() -> bool:

@@ -289,7 +289,8 @@ def test_without_an_instant_to_hold_the_first_block_there_is_no_departure_slot(s
 def test_the_last_instant_of_the_window_is_a_departure_slot(search: Search) -> None:
     city = drawn("AB")
     planner = planner_in(city.airspace, [Hold(city["A"], 0, 10)], search)
-    assert planner.plan(flight(city["A"], city["B"], latest=10)).departure_ms == 10
+    plan = planner.plan(flight(city["A"], city["B"], latest=10))
+    assert (plan.departure_ms, plan.arrival_ms, plan.delay_ms) == (10, 14, 10)
 
 
 @both_searches
@@ -340,8 +341,10 @@ def test_a_flight_whose_earliest_arrival_exceeds_its_endurance_takes_a_later_and
     planner = planner_in(city.airspace, [Hold(city["A"], 10, 70), Hold(city["m"], 35, 60), Hold(city["n"], 0, 30)])
     tireless = planner.plan(flight(city["A"], city["B"], latest=100))
     assert (tireless.departure_ms, tireless.arrival_ms) == (5, 38)
-    plan = planner.plan(flight(city["A"], city["B"], latest=100, endurance_ms=32))
+    plan = planner.plan(flight(city["A"], city["B"], latest=100, endurance_ms=12))
     assert (plan.departure_ms, plan.arrival_ms) == (70, 82)
+    with pytest.raises(EnduranceExceeded):
+        planner.plan(flight(city["A"], city["B"], latest=100, endurance_ms=11))
 
 
 # Waiting
@@ -383,6 +386,22 @@ def test_waiting_stays_in_the_air_where_moving_it_would_make_a_conflict() -> Non
         Visit(city["n"], 34, 34),
         Visit(city["B"], 38, 38),
     ]
+
+
+def test_waiting_moves_back_over_a_diagonal_only_as_far_as_its_side_blocks_allow() -> None:
+    city = drawn("As# .mB")
+    planner = planner_in(city.airspace, [Hold(city["B"], 0, 30), Hold(city["s"], 28, 29)])
+    plan = planner.plan(flight(city["A"], city["B"], latest=60))
+    assert trajectory_of(plan) == [Visit(city["A"], 21, 21), Visit(city["m"], 27, 30), Visit(city["B"], 34, 34)]
+
+
+@both_searches
+def test_a_flight_that_has_to_leave_its_block_early_takes_two_short_links_for_a_long_one(search: Search) -> None:
+    city = drawn("AC #B", rule=MIDPOINT)
+    planner = planner_in(city.airspace, [Hold(city["A"], 3, 60)], search)
+    plan = planner.plan(flight(city["A"], city["B"]))
+    assert trajectory_of(plan) == [Visit(city["A"], 0, 0), Visit(city["C"], 4, 4), Visit(city["B"], 8, 8)]
+    assert (plan.flight_time_ms, plan.delay_ms) == (8, 2)
 
 
 @pytest.mark.parametrize(
@@ -500,12 +519,12 @@ def test_a_block_can_be_entered_at_a_reservations_exclusive_end_and_not_1_ms_bef
     assert (plan.departure_ms, plan.arrival_ms) == (departure_ms, departure_ms + 4)
 
 
-@pytest.mark.parametrize(("enter_ms", "departure_ms"), [(5, 0), (4, 9)])
-def test_the_last_instant_of_a_flight_needs_its_block_too(enter_ms: int, departure_ms: int) -> None:
-    city = drawn("AB")
-    planner = planner_in(city.airspace, [Hold(city["B"], enter_ms, 9)])
-    plan = planner.plan(flight(city["A"], city["B"], latest=60))
-    assert (plan.departure_ms, plan.arrival_ms) == (departure_ms, departure_ms + 4)
+@both_searches
+@pytest.mark.parametrize(("enter_ms", "arrival_ms"), [(9, 8), (8, 13)])
+def test_the_last_instant_of_a_flight_needs_its_block_too(search: Search, enter_ms: int, arrival_ms: int) -> None:
+    city = drawn("A. ..", ".. .B")
+    planner = planner_in(city.airspace, [Hold(city["B"], enter_ms, enter_ms + 1)], search)
+    assert planner.plan(flight(city["A"], city["B"], latest=60)).arrival_ms == arrival_ms
 
 
 def test_a_head_on_swap_at_one_instant_is_a_conflict() -> None:
