@@ -151,7 +151,12 @@ class Deconfliction:
 
         def look_up() -> Outcome | None:
             intent = self._ledger.find(intent_id)
-            return None if intent is None else Outcome(intent)
+            if intent is not None:
+                return Outcome(intent)
+            first = None if key is None else self._ledger.answer_to(submission.operator, key.key)
+            if key is None or first is None or first.body_digest != key.body_digest:
+                return None
+            return Outcome(first.intent, replayed=first.answer)
 
         return await self._enqueue(lambda tx, now: self._submit(tx, now, intent_id, submission, key), look_up)
 
@@ -197,11 +202,14 @@ class Deconfliction:
             self._serve()
         finally:
             while not self._queue.empty():
-                if (job := self._queue.get_nowait()) is not None:
+                job = self._queue.get_nowait()
+                if job is not None and job.future.set_running_or_notify_cancel():
                     job.future.set_exception(LedgerUnavailable("the ledger writer has stopped; nothing was recorded"))
 
     def _serve(self) -> None:
         while not self._stopping and (first := self._queue.get()) is not None:
+            if not first.future.set_running_or_notify_cancel():
+                continue
             taken = [first]
             answers: list[object]
             try:
@@ -234,7 +242,6 @@ class Deconfliction:
 
     def _arrivals(self, taken: list[_Job]) -> Iterator[_Job]:
         """Yield the request in `taken`, then append and yield waiting ones until the batch is full."""
-        taken[0].future.set_running_or_notify_cancel()
         yield taken[0]
         until = time.perf_counter() + BATCH_PLANNING_S
         while len(taken) < BATCH_REQUESTS and time.perf_counter() < until:
@@ -245,8 +252,10 @@ class Deconfliction:
             if job is None:
                 self._stopping = True
                 return
-            taken.append(job)
-            yield job
+            # From here on nobody can give it up, so that its answer has a place to go.
+            if job.future.set_running_or_notify_cancel():
+                taken.append(job)
+                yield job
 
     def _run(self, job: _Job, transaction: Transaction, now: int) -> object:
         """Return a request's answer, or the exception that is its answer; its neighbours are not harmed."""

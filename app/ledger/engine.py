@@ -1,6 +1,7 @@
 """Opening a ledger: where it is, whether it is one, which schema it has, whose airspace it belongs to."""
 
 import sqlite3
+from contextlib import closing
 from importlib.resources import files
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, create_engine, event, insert, select
+from sqlalchemy import URL, Connection, Engine, create_engine, event, insert, select
 from sqlalchemy.exc import DatabaseError
 
 from app.errors import AirspaceMismatch, ForeignLedger, LedgerMissing, LedgerOutdated, StartupError
@@ -39,19 +40,16 @@ def create_or_upgrade(location: str) -> str:
     Raises `ForeignLedger` for a file that is something else, `LedgerOutdated` for one newer than this program.
     """
     path = sqlite_path(location)
+    if not path.parent.is_dir():
+        raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
     if path.exists() and path.stat().st_size > 0:
         _check_is_ledger(path)
-    elif not path.parent.is_dir():
-        raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
+    else:
+        _mark(path)
     engine = _engine(path, writes=True)
     try:
-        with engine.connect() as connection:
-            driver = connection.connection.dbapi_connection
-            assert isinstance(driver, sqlite3.Connection)
-            driver.execute("PRAGMA journal_mode = WAL")
-            driver.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            with connection.begin():
-                _schema(connection, path)
+        with engine.begin() as connection:
+            if _schema(connection, path) != _head():
                 config = _alembic()
                 config.attributes["connection"] = connection
                 command.upgrade(config, "head")
@@ -101,7 +99,7 @@ def open_ledger(location: str, airspace: Airspace, *, claim: bool = False) -> Le
 def _engine(path: Path, *, writes: bool) -> Engine:
     """Return an engine whose transactions hold the write lock from the start, or cannot write at all."""
     engine = create_engine(
-        f"sqlite:///{path}",
+        URL.create("sqlite", database=str(path)),
         pool_size=1 if writes else _READERS,
         max_overflow=0,
         connect_args={"timeout": _BUSY_TIMEOUT_S, "check_same_thread": False, "isolation_level": None},
@@ -120,16 +118,26 @@ def _engine(path: Path, *, writes: bool) -> Engine:
     return engine
 
 
-def _check_is_ledger(path: Path) -> None:
+def _mark(path: Path) -> None:
+    """Make an empty file a ledger; the mark comes first, so that one whose creation was cut short is still one."""
     try:
-        connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-        try:
-            found = connection.execute("PRAGMA application_id").fetchone()[0]
-        finally:
-            connection.close()
+        with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S, isolation_level=None)) as connection:
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute("PRAGMA journal_mode = WAL")
     except sqlite3.Error as error:
-        raise ForeignLedger(f"{path} is not an AirMatrix ledger: {error}") from error
-    if found != APPLICATION_ID:
+        raise StartupError(f"cannot create ledger {path}: {error}") from error
+
+
+def _check_is_ledger(path: Path) -> None:
+    """Look at the file's header only: SQLite itself may write beside a database that it merely opens."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(100)
+    except OSError as error:
+        raise ForeignLedger(f"cannot read ledger {path}: {error.strerror}") from error
+    if not header.startswith(b"SQLite format 3\0"):
+        raise ForeignLedger(f"{path} is not an AirMatrix ledger; nothing was changed in it")
+    if int.from_bytes(header[68:72]) != APPLICATION_ID:
         raise ForeignLedger(f"{path} is a SQLite database, but not an AirMatrix ledger; nothing was changed in it")
 
 

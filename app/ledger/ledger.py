@@ -117,6 +117,11 @@ class Ledger:
         with self._reading() as connection:
             return _find(connection, self._airspace, intent_id)
 
+    def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
+        """Return the first answer to an idempotency key, None if it is new."""
+        with self._reading() as connection:
+            return _answer_to(connection, self._airspace, operator, key)
+
     def page(
         self,
         *,
@@ -293,17 +298,7 @@ class Transaction:
 
     def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
         """Return the first answer to an idempotency key, None if it is new."""
-        query = (
-            select(idempotency_keys, flight_intents.c.id)
-            .join(flight_intents, flight_intents.c.sequence == idempotency_keys.c.intent)
-            .where(idempotency_keys.c.operator == operator, idempotency_keys.c.key == key)
-        )
-        row = self._connection.execute(query).one_or_none()
-        if row is None:
-            return None
-        intent = self.find(row.id)
-        assert intent is not None
-        return IdempotencyRecord(row.body_digest, intent, row.answer.encode())
+        return _answer_to(self._connection, self._airspace, operator, key)
 
     def remember_answer(
         self, operator: str, key: str, body_digest: str, intent: FlightIntent, answer: bytes, now_ms: int
@@ -357,6 +352,20 @@ def _find(connection: Connection, airspace: Airspace, intent_id: str) -> FlightI
     return to_intent(row, airspace, _reservations(connection, airspace, [row.sequence])[row.sequence])
 
 
+def _answer_to(connection: Connection, airspace: Airspace, operator: str, key: str) -> IdempotencyRecord | None:
+    query = (
+        select(idempotency_keys, flight_intents.c.id)
+        .join(flight_intents, flight_intents.c.sequence == idempotency_keys.c.intent)
+        .where(idempotency_keys.c.operator == operator, idempotency_keys.c.key == key)
+    )
+    row = connection.execute(query).one_or_none()
+    if row is None:
+        return None
+    intent = _find(connection, airspace, row.id)
+    assert intent is not None
+    return IdempotencyRecord(row.body_digest, intent, row.answer.encode())
+
+
 def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:
     """Return the reservations of some intents, each sorted by enter, then i, j, k."""
     query = select(reservations).where(reservations.c.intent.in_(sequences))
@@ -385,7 +394,7 @@ def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:
 
 def _ids(connection: Connection, sequences: Sequence[int]) -> dict[int, str]:
     query = select(flight_intents.c.sequence, flight_intents.c.id).where(flight_intents.c.sequence.in_(sequences))
-    return dict(connection.execute(query).tuples().all())
+    return {row.sequence: row.id for row in connection.execute(query)}
 
 
 def _journal_after(connection: Connection, revision: int, limit: int | None) -> list[JournalEntry]:

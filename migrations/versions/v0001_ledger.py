@@ -23,6 +23,13 @@ WHEN EXISTS (
 BEGIN SELECT RAISE(ABORT, 'reservations_no_overlap'); END
 """
 
+# Also against INSERT OR REPLACE, which fires no DELETE trigger.
+IN_ORDER = """
+CREATE TRIGGER journal_in_order BEFORE INSERT ON journal
+WHEN NEW.revision <= (SELECT MAX(revision) FROM journal)
+BEGIN SELECT RAISE(ABORT, 'journal_in_order'); END
+"""
+
 APPEND_ONLY = """
 CREATE TRIGGER journal_append_only_on_{event} BEFORE {event} ON journal
 BEGIN SELECT RAISE(ABORT, 'journal_append_only'); END
@@ -114,5 +121,6 @@ def upgrade() -> None:
     op.create_index("idempotency_keys_by_age", "idempotency_keys", ["created"])
     op.execute(OVERLAP.format(event="INSERT", other_than_old=""))
     op.execute(OVERLAP.format(event="UPDATE", other_than_old="AND NOT (block = OLD.block AND enter = OLD.enter)"))
+    op.execute(IN_ORDER)
     for event in ("UPDATE", "DELETE"):
         op.execute(APPEND_ONLY.format(event=event))
