@@ -2,6 +2,7 @@
 
 ClientError
 ├── ServiceUnreachable   no answer
+├── UnexpectedAnswer     an answer that is not AirMatrix's
 └── ProblemAnswer        the service answered with a problem document
 """
 
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import httpx
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from app.flight_intents import State
 from app.routes.aircraft_types import AircraftTypeAnswer, AircraftTypeList
@@ -33,6 +34,10 @@ class ServiceUnreachable(ClientError):
     """The service did not answer."""
 
 
+class UnexpectedAnswer(ClientError):
+    """Something answered, but not like AirMatrix."""
+
+
 class ProblemAnswer(ClientError):
     """The service answered with a problem; `members` is the whole document."""
 
@@ -53,7 +58,10 @@ class Client:
     def __init__(
         self, url: str = DEFAULT_URL, timeout_s: float = 30.0, transport: httpx.BaseTransport | None = None
     ) -> None:
-        self._http = httpx.Client(base_url=url, timeout=timeout_s, transport=transport)
+        try:
+            self._http = httpx.Client(base_url=url, timeout=timeout_s, transport=transport)
+        except httpx.InvalidURL as error:
+            raise ServiceUnreachable(f"{url!r} is not an address: {error}") from error
 
     def __enter__(self) -> "Client":
         return self
@@ -118,12 +126,16 @@ class Client:
         try:
             response = self._http.request(method, path, **arguments)
         except httpx.TransportError as error:
-            raise ServiceUnreachable(
-                f"no answer from {self._http.base_url}: {error or type(error).__name__}"
-            ) from error
+            cause = str(error) or type(error).__name__
+            raise ServiceUnreachable(f"no answer from {self._http.base_url}: {cause}") from error
         if response.is_error:
             raise ProblemAnswer(response.status_code, _members(response))
-        return answer.model_validate_json(response.content)
+        try:
+            return answer.model_validate_json(response.content)
+        except ValidationError as error:
+            raise UnexpectedAnswer(
+                f"{self._http.base_url} does not answer like AirMatrix: {method} {path}: {error.errors()[0]['msg']}"
+            ) from error
 
 
 def grid_of(answer: AirspaceAnswer) -> AirMatrix:
