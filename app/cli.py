@@ -11,13 +11,13 @@ import structlog
 import typer
 import uvicorn
 from pydantic import ValidationError
-from rich.console import Console
 
 from app import auth, logs, service
 from app.client import ClientError
 from app.commands.airspace import airspace_app
 from app.commands.plan import plan
 from app.commands.simulate import simulate
+from app.commands.terminal import remark, write
 from app.commands.verify import verify
 from app.errors import LedgerMissing, RequestError, StartupError
 from app.ledger import create_or_upgrade
@@ -45,7 +45,7 @@ cli.command()(verify)
 def main() -> None:
     """Run a command; what it refuses is one line on stderr and exit status 2."""
     try:
-        cli()
+        cli(prog_name="airmatrix")
     except (StartupError, PlannerError, RequestError, ClientError) as error:
         _fail(str(error))
     except ValidationError as error:
@@ -85,7 +85,7 @@ def serve(
 def openapi(out: Annotated[Path, typer.Option(help="The file to write.")]) -> None:
     """Write the OpenAPI document."""
     document = create_app(Settings()).openapi()
-    out.write_bytes(orjson.dumps(document, option=orjson.OPT_INDENT_2) + b"\n")
+    write(out, orjson.dumps(document, option=orjson.OPT_INDENT_2) + b"\n")
 
 
 @cli.command("version")
@@ -116,5 +116,5 @@ def _bind(host: str, port: int) -> socket.socket:
 
 
 def _fail(message: str) -> None:
-    Console(stderr=True).print(f"[red]error:[/] {message}", soft_wrap=True, highlight=False)
+    remark("error", "red", message)
     sys.exit(2)

@@ -42,7 +42,10 @@ class ProblemAnswer(ClientError):
     """The service answered with a problem; `members` is the whole document."""
 
     def __init__(self, status: int, members: dict[str, Any]) -> None:
-        super().__init__(f"{status} {members.get('title', '')}: {members.get('detail', '')}")
+        what = members.get("detail") or members.get("reason")
+        super().__init__(
+            ": ".join(str(part) for part in (f"{status} {members.get('title', '')}".strip(), what) if part)
+        )
         self.status = status
         self.members = members
 

@@ -140,8 +140,11 @@ class Airspace:
             + "\n]}\n"
         )
         partial = path.with_name(f"{path.name}.partial")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        try:
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def building_feature(building: Building) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """`airmatrix airspace build` and `airmatrix airspace show`."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from app.commands.progress import progress_bar
+from app.commands.terminal import progress_bar, remark
+from app.commands.terminal import show as show_table
 from app.service import load_airspace
 from app.settings import Settings
 from planner.airmatrix import AirMatrix
@@ -42,9 +43,12 @@ def build(
     name: Annotated[str | None, typer.Option(help="Default: the building file's.")] = None,
 ) -> None:
     """Turn building footprints into an airspace file."""
+    if not (math.isfinite(dwell) and (ground_w84 is None or math.isfinite(ground_w84))):
+        raise AirspaceFileError("--dwell and --ground-w84 must be finite numbers")
     data = read_buildings(buildings, default_height)
+    if out.exists() and out.samefile(buildings):
+        raise AirspaceFileError(f"--out {out} is the building file itself; choose another name")
     grid = _grid(data, epsg, origin, size, ceiling, block_side, block_height)
-    console = Console(stderr=True)
     with progress_bar("buildings", len(data.buildings)) as advance_to:
         airspace = build_airspace(
             data,
@@ -58,10 +62,10 @@ def build(
             on_progress=advance_to,
         )
     for warning, count in data.warnings.items():
-        console.print(f"[yellow]warning:[/] {count} {warning}")
+        remark("warning", "yellow", f"{count} {warning}")
     try:
         airspace.write(out)
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise AirspaceFileError(f"cannot write {out}: {error}") from error
     _describe(airspace)
 
@@ -119,4 +123,4 @@ def _describe(airspace: Airspace) -> None:
         table.add_row(f"occupied {floor:g}-{floor + grid.block_height_m:g} m", str(count))
     table.add_row("data", f"{airspace.attribution} {airspace.licence}")
     table.add_row("fingerprint", airspace.fingerprint)
-    Console().print(table)
+    show_table(table)

@@ -7,9 +7,9 @@ import numpy as np
 import orjson
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
+from app.commands.terminal import show, write
 from app.errors import UnknownAircraftType
 from app.service import load_aircraft_types, load_airspace
 from app.settings import Settings
@@ -55,15 +55,15 @@ def plan(
         if str(geojson) == "-":
             typer.echo(document)
             return
-        geojson.write_bytes(document + b"\n")
+        write(geojson, document + b"\n")
     _print(field.grid, path, aircraft)
 
 
 def _print(grid: AirMatrix, path: Plan, aircraft: str) -> None:
     title = f"{aircraft}: {path.flight_time_ms / 1000:.3f} s, {len(path.hold_block)} reservations"
     table = Table(title=title, box=box.SIMPLE)
-    for column in ("block", "lon", "lat", "alt m", "arrive", "depart"):
-        table.add_column(column)
+    for column in ("block", "lon", "lat", "alt m", "arrive UTC", "depart UTC"):
+        table.add_column(column, no_wrap=True)
     for block, (lon, lat, alt_m), arrive, depart in zip(
         grid.ijk(path.block).tolist(),
         _coordinates(grid, path),
@@ -71,8 +71,8 @@ def _print(grid: AirMatrix, path: Plan, aircraft: str) -> None:
         format_times(path.depart_ms),
         strict=True,
     ):
-        table.add_row(str(block), f"{lon:.7f}", f"{lat:.7f}", f"{alt_m:g}", arrive[11:], depart[11:])
-    Console().print(table)
+        table.add_row(str(block), f"{lon:.7f}", f"{lat:.7f}", f"{alt_m:g}", arrive[11:-1], depart[11:-1])
+    show(table)
 
 
 def _coordinates(grid: AirMatrix, path: Plan) -> list[list[float]]:

@@ -8,11 +8,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from app.client import DEFAULT_URL, Client, ProblemAnswer, grid_of
-from app.commands.progress import progress_bar
+from app.commands.terminal import progress_bar, remark, show
 from app.errors import StartupError
 from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody
 from app.times import format_time, now_ms, parse_time
@@ -72,7 +71,7 @@ def simulate(
                     _submit(client, body, tally)
                     advance_to(number)
             except KeyboardInterrupt:
-                Console(stderr=True).print("interrupted; what was accepted stays reserved")
+                remark("interrupted", "yellow", "what was accepted stays reserved")
         seconds = time.perf_counter() - began
     _print(tally, seconds, f"{answer.name}, {answer.occupancy_rule}, {answer.search}")
 
@@ -155,4 +154,4 @@ def _print(tally: Tally, seconds: float, title: str) -> None:
         table.add_row(
             "latency", f"median {median:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms, max {max(tally.latency_ms):.1f} ms"
         )
-    Console().print(table)
+    show(table)

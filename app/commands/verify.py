@@ -5,10 +5,9 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
-from app.commands.progress import progress_bar
+from app.commands.terminal import progress_bar, remark, show
 from app.flight_intents import FlightIntent, State
 from app.ledger import Ledger, open_ledger
 from app.service import load_airspace
@@ -90,12 +89,11 @@ def _print(report: Report, states: dict[State, int], title: str, grid: AirMatrix
         table.add_row("closest vertically", f"{vertical.vertical_m:.3f} m, {vertical.horizontal_m:.3f} m horizontally")
     if clearance is not None:
         table.add_row("closest building", f"{clearance.distance_m:.3f} m, {clearance.building}{promise}")
-    Console().print(table)
-    console = Console(stderr=True)
+    show(table)
     for violation in report.violations[:_SHOWN]:
-        console.print(f"[red]violation:[/] {_sentence(violation)}", soft_wrap=True)
+        remark("violation", "red", _sentence(violation))
     if len(report.violations) > _SHOWN:
-        console.print(f"… and {len(report.violations) - _SHOWN} more")
+        remark("violation", "red", f"… and {len(report.violations) - _SHOWN} more")
 
 
 def _counts(report: Report) -> dict[str, int]:
