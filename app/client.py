@@ -42,10 +42,8 @@ class ProblemAnswer(ClientError):
     """The service answered with a problem; `members` is the whole document."""
 
     def __init__(self, status: int, members: dict[str, Any]) -> None:
-        what = members.get("detail") or members.get("reason")
-        super().__init__(
-            ": ".join(str(part) for part in (f"{status} {members.get('title', '')}".strip(), what) if part)
-        )
+        kind = f"{status} {members.get('title', '')}".strip()
+        super().__init__(": ".join(filter(None, (kind, members.get("detail") or members.get("reason")))))
         self.status = status
         self.members = members
 

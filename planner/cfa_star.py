@@ -102,9 +102,7 @@ class Planner:
         found = self._search(request)
         if isinstance(found, Plan):
             return found
-        later = self._search(replace(request, latest_departure_ms=request.latest_departure_ms + _OUTLOOK_MS))
-        if isinstance(later, Plan):
-            found.earliest_feasible_departure_ms = later.departure_ms
+        found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request)
         raise found
 
     def unconstrained(self, request: PlanRequest) -> int:
@@ -162,6 +160,20 @@ class Planner:
             f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s"
         )
 
+    def _earliest_feasible_departure(self, request: PlanRequest) -> int | None:
+        """Return the earliest departure after the request's window from which there is a plan, None if none is near."""
+        earliest = None
+        latest = request.latest_departure_ms + _OUTLOOK_MS
+        while latest > request.latest_departure_ms:
+            later = self._search(replace(request, latest_departure_ms=latest))
+            if isinstance(later, NoPlan):
+                break
+            # Who departs as soon as the first block is free may have to hover, which an endurance may not allow.
+            endurance_matters = request.performance.endurance_ms is not None
+            earliest = later.departure_ms if endurance_matters else later.slot_opens_ms
+            latest = later.slot_opens_ms - 1
+        return earliest
+
     def _owners_around(self, labels: int) -> tuple[int, ...]:
         """Return the owners of the reservations that shut in a search without a path, in the order it met them."""
         owners: dict[int, None] = {}
@@ -198,6 +210,7 @@ class Planner:
         """Turn the labels of a finished search into a plan."""
         ws = self._workspace
         block, arrive, depart, gap_end = path_kernels.trace(ws.labels, goal, task)
+        slot_opens_ms = int(arrive[0])
         if self.search is Search.SAFE_INTERVAL:
             path_kernels.wait_early(motion, self.index.slabs, block, arrive, depart, gap_end)
         path_kernels.hold_on_ground(arrive, depart, task)
@@ -213,6 +226,7 @@ class Planner:
             hold_enter_ms=hold_enter,
             hold_exit_ms=hold_exit,
             earliest_departure_ms=task.earliest,
+            slot_opens_ms=slot_opens_ms,
             unconstrained_ms=self._unconstrained(motion, task) if disturbed else undisturbed_ms,
             terminal_dwell_ms=task.dwell,
             expansions=expansions,

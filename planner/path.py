@@ -11,7 +11,9 @@ class Plan:
 
     `block`, `arrive_ms`, `depart_ms` (n,): the chain of block centres; the first arrival is the departure, the
     last departure the arrival, terminal dwell included. `hold_*` (m,): half-open holds [enter, exit), overlapping
-    ones of a block merged, sorted by enter, then i, j, k. `unconstrained_ms` is the flight time without traffic.
+    ones of a block merged, sorted by enter, then i, j, k. `slot_opens_ms` is the first moment,
+    from the earliest departure on, of the free interval in which the first block is left. `unconstrained_ms` is the
+    flight time without traffic.
     """
 
     block: IntArray
@@ -21,6 +23,7 @@ class Plan:
     hold_enter_ms: IntArray
     hold_exit_ms: IntArray
     earliest_departure_ms: int
+    slot_opens_ms: int
     unconstrained_ms: int
     terminal_dwell_ms: int
     expansions: int

@@ -248,6 +248,28 @@ def test_the_departure_that_a_refusal_names_is_after_the_window_and_works(situat
         pass
 
 
+@given(situations())
+@unhurried
+def test_no_departure_between_the_window_and_the_one_that_a_refusal_names_has_a_plan(situation: Situation) -> None:
+    planner = planner_in(situation.airspace, situation.reservations)
+    request = situation.request
+    try:
+        planner.plan(request)
+    except NoPlan as refusal:
+        named = refusal.earliest_feasible_departure_ms
+        if named is not None and named > request.latest_departure_ms + 1:
+            between = flight(
+                request.origin,
+                request.destination,
+                earliest=request.latest_departure_ms + 1,
+                latest=named - 1,
+                times=request.performance.times,
+            )
+            assert earliest_arrival(situation.airspace, situation.reservations, between) is None
+    except NotPlannable:
+        pass
+
+
 def hover_times(trajectory: list[Visit], terminal_dwell_ms: int) -> list[int]:
     """Return the waits at each block's centre, terminal dwell excluded."""
     waits = [visit.depart_ms - visit.arrive_ms for visit in trajectory]
