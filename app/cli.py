@@ -1,7 +1,9 @@
 """The `airmatrix` command."""
 
+import signal
 import socket
 import sys
+import traceback
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
@@ -30,6 +32,7 @@ from planner.errors import PlannerError
 log = structlog.get_logger()
 
 _GRACE_S = 5
+_UNEXPECTED = 70
 
 cli = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, help="Strategic deconfliction for urban air mobility."
@@ -50,6 +53,10 @@ def main() -> None:
         _fail(str(error))
     except ValidationError as error:
         _fail("; ".join(f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()))
+    except Exception:
+        # Not 1: that is how `verify` says that it found a violation.
+        traceback.print_exc()
+        sys.exit(_UNEXPECTED)
 
 
 @cli.command()
@@ -65,8 +72,10 @@ def serve(
     settings = Settings.given(host=host, port=port, ledger=ledger, airspace=airspace, aircraft_types=aircraft_types)
     logs.configure(settings)
     auth.check_listening(settings)
-    # Bound before anything is created, listening only when everything is ready.
-    listener = _bind(settings.host, settings.port)
+    # uvicorn ends by raising the signal that stopped it; a clean exit still closes the ledger.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    # Taken before anything is created; who connects early waits until everything is ready.
+    listener = _listen(settings.host, settings.port)
     with listener, service.running(settings, now_ms) as running:
         if settings.allow_unauthenticated:
             log.warning("AIRMATRIX_ALLOW_UNAUTHENTICATED: anybody who reaches this address can plan and cancel flights")
@@ -77,7 +86,8 @@ def serve(
             timeout_graceful_shutdown=_GRACE_S,
         )
         address, bound = listener.getsockname()[:2]
-        log.info("listening", url=f"http://{address}:{bound}", docs=f"http://{address}:{bound}/docs")
+        url = f"http://{f'[{address}]' if ':' in address else address}:{bound}"
+        log.info("listening", url=url, docs=f"{url}/docs")
         uvicorn.Server(config).run(sockets=[listener])
 
 
@@ -98,17 +108,19 @@ def print_version() -> None:
 def upgrade(ledger: Annotated[str | None, typer.Option(help="Ledger file or URL.")] = None) -> None:
     """Bring a ledger to the newest schema."""
     location = Settings.given(ledger=ledger).ledger
-    if not sqlite_path(location).exists():
+    path = sqlite_path(location)
+    if not path.exists() or path.stat().st_size == 0:
         raise LedgerMissing(f"there is no ledger at {location}; `airmatrix serve` creates one")
     typer.echo(f"{location} has schema {create_or_upgrade(location)}")
 
 
-def _bind(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host.removeprefix("[").removesuffix("]"), port))
+        listener.listen()
     except OSError as error:
         listener.close()
         raise StartupError(f"cannot listen on {host}:{port}: {error.strerror}; choose another with --port") from error

@@ -8,6 +8,7 @@ ClientError
 
 from collections.abc import Iterator
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, ValidationError
@@ -81,7 +82,7 @@ class Client:
 
     def flight_intent(self, intent_id: str) -> FlightIntentAnswer:
         """Read a flight intent."""
-        return self._send(FlightIntentAnswer, "GET", f"/v1/flight-intents/{intent_id}")
+        return self._send(FlightIntentAnswer, "GET", f"/v1/flight-intents/{quote(intent_id, safe='')}")
 
     def flight_intents(self, operator: str | None = None, state: State | None = None) -> Iterator[FlightIntentAnswer]:
         """Yield all flight intents by sequence, page by page."""
@@ -96,7 +97,7 @@ class Client:
 
     def cancel(self, intent_id: str) -> FlightIntentAnswer:
         """Cancel a flight intent."""
-        return self._send(FlightIntentAnswer, "DELETE", f"/v1/flight-intents/{intent_id}")
+        return self._send(FlightIntentAnswer, "DELETE", f"/v1/flight-intents/{quote(intent_id, safe='')}")
 
     def airspace(self) -> AirspaceAnswer:
         """Read the airspace."""

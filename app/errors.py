@@ -19,6 +19,7 @@ StartupError                 the service or a command cannot start; the CLI prin
 ├── LedgerMissing            no ledger at that place
 ├── ForeignLedger            a file that is no AirMatrix ledger
 ├── LedgerOutdated           a ledger of another schema version
+├── LedgerDamaged            a row that no version of this program has written
 ├── AirspaceMismatch         a ledger of another airspace
 └── UnsafeListening          listening beyond loopback without authentication
 """
@@ -98,6 +99,10 @@ class ForeignLedger(StartupError):
 
 class LedgerOutdated(StartupError):
     """The ledger's schema is of another version."""
+
+
+class LedgerDamaged(StartupError):
+    """A row of the ledger makes no sense."""
 
 
 class AirspaceMismatch(StartupError):

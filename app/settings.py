@@ -8,6 +8,9 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from planner.cfa_star import Search
 
+# A day: no hover and no ground hold is longer.
+_LONGEST_S = 86_400.0
+
 
 class Settings(BaseSettings):
     """Frozen; unknown ``AIRMATRIX_*`` variables are ignored, malformed ones refused."""
@@ -21,10 +24,10 @@ class Settings(BaseSettings):
     aircraft_types: Path | None = None
 
     search: Search = Search.SAFE_INTERVAL
-    hover_limit_s: Annotated[float, Field(gt=0)] = 60.0
-    ground_hold_s: Annotated[float, Field(ge=0)] = 300.0
+    hover_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 60.0
+    ground_hold_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 300.0
     horizon_days: Annotated[float, Field(gt=0, le=60)] = 30.0
-    idempotency_hours: Annotated[float, Field(gt=0)] = 24.0
+    idempotency_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 24.0
 
     queue_limit: Annotated[int, Field(ge=1)] = 1024
     max_body_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024

@@ -23,6 +23,8 @@ from planner.errors import AirspaceFileError, Block, DestinationBlocked, OriginB
 
 FORMAT = "airmatrix-airspace/1"
 
+MAX_DWELL_MS = 3_600_000
+
 BoolArray = npt.NDArray[np.bool_]
 
 
@@ -64,8 +66,8 @@ class Airspace:
             raise AirspaceFileError(
                 f"static occupancy has shape {self.occupied.shape}, the grid has {self.grid.block_count} blocks"
             )
-        if self.terminal_dwell_ms < 0:
-            raise AirspaceFileError("the terminal dwell cannot be negative")
+        if not 0 <= self.terminal_dwell_ms <= MAX_DWELL_MS:
+            raise AirspaceFileError("the terminal dwell must lie between 0 and an hour")
         self.occupied.setflags(write=False)
 
     @cached_property
@@ -100,7 +102,7 @@ class Airspace:
         if self.occupied[self.grid.index(block)]:
             nearest = self.nearest_free_block(lon, lat, alt_m)
             hint = "" if nearest is None else f"; the nearest free block is {list(nearest)}"
-            raise if_blocked(f"block {list(block)} is occupied by a building{hint}", nearest)
+            raise if_blocked(f"{if_blocked.end} in block {list(block)}, which a building occupies{hint}", nearest)
         return self.grid.index(block)
 
     def nearest_free_block(self, lon: float, lat: float, alt_m: float) -> Block | None:
@@ -139,6 +141,8 @@ class Airspace:
             + ",\n".join(lines)
             + "\n]}\n"
         )
+        if path.exists() and not path.is_file():
+            raise OSError(f"{path} is not a regular file")
         partial = path.with_name(f"{path.name}.partial")
         try:
             partial.write_text(text, encoding="utf-8")

@@ -113,15 +113,12 @@ class Planner:
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to these blocks, if any."""
-        occupied = self.airspace.occupied
-        if occupied[origin]:
-            raise OriginBlocked(f"the origin's block {self.airspace.grid.block(origin)} is occupied by a building")
-        if occupied[destination]:
-            raise DestinationBlocked(
-                f"the destination's block {self.airspace.grid.block(destination)} is occupied by a building"
-            )
+        grid = self.airspace.grid
+        for block, error in ((origin, OriginBlocked), (destination, DestinationBlocked)):
+            if self.airspace.occupied[block]:
+                raise error(f"{error.end} in block {list(grid.block(block))}, which a building occupies")
         if origin == destination:
-            raise SameBlock(f"origin and destination lie in one block, {self.airspace.grid.block(origin)}")
+            raise SameBlock(f"origin and destination lie in one block, {list(grid.block(origin))}")
         if self._components[origin] != self._components[destination]:
             raise Disconnected("buildings leave no way from the origin's block to the destination's")
 

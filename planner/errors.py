@@ -57,12 +57,14 @@ class OriginBlocked(NotPlannable):
     """The origin lies in a statically occupied block."""
 
     reason = "origin_blocked"
+    end = "the origin lies"
 
 
 class DestinationBlocked(NotPlannable):
     """The destination lies in a statically occupied block."""
 
     reason = "destination_blocked"
+    end = "the destination lies"
 
 
 class SameBlock(NotPlannable):

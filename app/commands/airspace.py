@@ -13,7 +13,7 @@ from app.service import load_airspace
 from app.settings import Settings
 from planner.airmatrix import AirMatrix
 from planner.airspace import Airspace, OccupancyRule
-from planner.buildings import BuildingData, build_airspace, read_buildings
+from planner.buildings import BuildingData, Window, build_airspace, read_buildings
 from planner.errors import AirspaceFileError
 
 airspace_app = typer.Typer(help="Build airspace files and look at them.", no_args_is_help=True)
@@ -48,7 +48,15 @@ def build(
     data = read_buildings(buildings, default_height)
     if out.exists() and out.samefile(buildings):
         raise AirspaceFileError(f"--out {out} is the building file itself; choose another name")
-    grid = _grid(data, epsg, origin, size, ceiling, block_side, block_height)
+    window = _window(data, epsg, origin, size)
+    grid = AirMatrix.covering(
+        epsg=window.epsg,
+        origin_m=window.origin_m,
+        size_m=window.size_m,
+        ceiling_m=ceiling,
+        block_side_m=block_side,
+        block_height_m=block_height,
+    )
     with progress_bar("buildings", len(data.buildings)) as advance_to:
         airspace = build_airspace(
             data,
@@ -78,37 +86,26 @@ def show(
     _describe(load_airspace(Settings.given(airspace=airspace)))
 
 
-def _grid(
-    data: BuildingData,
-    epsg: int | None,
-    origin: tuple[float, float] | None,
-    size: tuple[float, float] | None,
-    ceiling: float,
-    block_side: float,
-    block_height: float,
-) -> AirMatrix:
-    window = data.window
-    missing = [
-        option
-        for option, value in (("--epsg", epsg), ("--origin", origin), ("--size", size))
-        if value is None and window is None
-    ]
-    if missing:
+def _window(
+    data: BuildingData, epsg: int | None, origin: tuple[float, float] | None, size: tuple[float, float] | None
+) -> Window:
+    """Return the file's window with what the options say otherwise; `AirspaceFileError` names what neither says."""
+    if data.window is not None:
+        epsg = data.window.epsg if epsg is None else epsg
+        origin = origin or data.window.origin_m
+        size = size or data.window.size_m
+    if epsg is None or origin is None or size is None:
+        missing = [name for name, value in (("--epsg", epsg), ("--origin", origin), ("--size", size)) if value is None]
         raise AirspaceFileError(f"the building file has no metadata.window; give {', '.join(missing)}")
-    return AirMatrix.covering(
-        epsg=epsg if epsg is not None else window.epsg,  # type: ignore[union-attr]
-        origin_m=origin if origin is not None else window.origin_m,  # type: ignore[union-attr]
-        size_m=size if size is not None else window.size_m,  # type: ignore[union-attr]
-        ceiling_m=ceiling,
-        block_side_m=block_side,
-        block_height_m=block_height,
-    )
+    return Window(epsg, origin, size)
 
 
 def _describe(airspace: Airspace) -> None:
     grid = airspace.grid
     west, south, east, north = grid.bounds
     table = Table(title=f"{airspace.name} ({airspace.id})", show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(overflow="fold")
     table.add_row(
         "blocks", f"{' x '.join(map(str, grid.dimensions))} of {grid.block_side_m:g} x {grid.block_height_m:g} m"
     )

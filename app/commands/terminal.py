@@ -26,7 +26,8 @@ def remark(label: str, style: str, message: str) -> None:
 def progress_bar(what: str, total: float) -> Iterator[Callable[[float], None]]:
     """Show a bar while the block runs; call what it yields with how much is done."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=_console(stderr=True), transient=True) as progress:
+    console = _console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
 

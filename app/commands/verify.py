@@ -8,7 +8,7 @@ import typer
 from rich.table import Table
 
 from app.commands.terminal import progress_bar, remark, show
-from app.flight_intents import FlightIntent, State
+from app.flight_intents import FlightIntent, Reservations, State, Trajectory
 from app.ledger import Ledger, open_ledger
 from app.service import load_airspace
 from app.settings import Settings
@@ -35,41 +35,53 @@ def verify(
         book.close()
     with progress_bar("checking", 1.0) as advance_to:
         report = judge(field, flights, lambda _, fraction: advance_to(fraction))
-    _print(report, states, f"{settings.ledger}: {field.name}", field.grid)
-    if not report.ok:
+    strays = [flight.id for flight in flights if len(flight.block) == 0 < len(flight.hold_block)]
+    _print(report, states, strays, f"{settings.ledger}: {field.name}", field.grid)
+    if strays or not report.ok:
         raise typer.Exit(1)
 
 
-def checked(intent: FlightIntent) -> CheckedFlight:
-    """Return an intent as the checker sees it: its trajectory where it still holds reservations for it."""
-    trajectory, held = intent.trajectory, intent.reservations
-    if trajectory is None or len(held) == 0:
-        none = np.empty(0, dtype=np.int64)
-        return CheckedFlight(intent.id, none, none, none, held.block, held.enter_ms, held.exit_ms)
+def _flights(book: Ledger) -> tuple[list[CheckedFlight], dict[State, int]]:
+    """Return all that holds or should hold reservations, as the checker sees it, and how many intents are in each state.
+
+    Reservations are read for themselves, not by way of the intents that should own them: those of a rejected or an
+    absent intent are judged too, as a flight without a trajectory.
+    """
+    held = book.held_by_intent()
+    flights = []
+    states = dict.fromkeys(State, 0)
+    with progress_bar("reading", book.count()) as advance_to:
+        for number, intent in enumerate(book.all_intents(), start=1):
+            states[intent.state] += 1
+            owned = held.pop(intent.sequence, Reservations.none())
+            if intent.trajectory is not None or len(owned):
+                flights.append(_checked(intent.id, owned, _trajectory(intent)))
+            advance_to(number)
+    flights += [_checked(f"unknown intent {sequence}", orphans, None) for sequence, orphans in held.items()]
+    return flights, states
+
+
+def _trajectory(intent: FlightIntent) -> Trajectory | None:
+    """Return what the intent must hold: nothing if it was refused, or cancelled before it departed."""
+    if intent.state is State.CANCELLED and len(intent.reservations) == 0:
+        return None
+    return intent.trajectory
+
+
+def _checked(name: str, held: Reservations, trajectory: Trajectory | None) -> CheckedFlight:
+    none = np.empty(0, dtype=np.int64)
     return CheckedFlight(
-        intent.id,
-        trajectory.block,
-        trajectory.arrive_ms,
-        trajectory.depart_ms,
+        name,
+        none if trajectory is None else trajectory.block,
+        none if trajectory is None else trajectory.arrive_ms,
+        none if trajectory is None else trajectory.depart_ms,
         held.block,
         held.enter_ms,
         held.exit_ms,
     )
 
 
-def _flights(book: Ledger) -> tuple[list[CheckedFlight], dict[State, int]]:
-    flights = []
-    states = dict.fromkeys(State, 0)
-    with progress_bar("reading", book.count()) as advance_to:
-        for number, intent in enumerate(book.all_intents(), start=1):
-            states[intent.state] += 1
-            if intent.trajectory is not None:
-                flights.append(checked(intent))
-            advance_to(number)
-    return flights, states
-
-
-def _print(report: Report, states: dict[State, int], title: str, grid: AirMatrix) -> None:
+def _print(report: Report, states: dict[State, int], strays: list[str], title: str, grid: AirMatrix) -> None:
     table = Table(title=title, show_header=False, title_justify="left")
     table.add_row("flight intents", ", ".join(f"{count} {state}" for state, count in states.items() if count) or "none")
     judged = f"{report.flights - report.released} flights, {report.reservations} reservations"
@@ -90,6 +102,8 @@ def _print(report: Report, states: dict[State, int], title: str, grid: AirMatrix
     if clearance is not None:
         table.add_row("closest building", f"{clearance.distance_m:.3f} m, {clearance.building}{promise}")
     show(table)
+    for stray in strays[:_SHOWN]:
+        remark("violation", "red", f"reservations that belong to no flight ({stray})")
     for violation in report.violations[:_SHOWN]:
         remark("violation", "red", _sentence(violation))
     if len(report.violations) > _SHOWN:

@@ -15,7 +15,7 @@ from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission, Trajectory
-from app.ledger.rows import HeldReservations, columns_of, dump_columns, to_held, to_intent, to_row
+from app.ledger.rows import HeldReservations, by_intent, columns_of, dump_columns, to_held, to_intent, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
@@ -154,6 +154,12 @@ class Ledger:
         while intents := self.page(after_sequence=sequence, limit=batch):
             yield from intents
             sequence = intents[-1].sequence
+
+    def held_by_intent(self) -> dict[int, Reservations]:
+        """Return all reservations by the sequence number they name, whether or not there is such an intent."""
+        with self._reading() as connection:
+            held = to_held(connection.execute(select(reservations)).all())
+        return by_intent(held, np.unique(held.sequence).tolist(), self._airspace.grid)
 
     def count(self) -> int:
         """Return how many intents are recorded."""
@@ -367,19 +373,9 @@ def _answer_to(connection: Connection, airspace: Airspace, operator: str, key: s
 
 
 def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:
-    """Return the reservations of some intents, each sorted by enter, then i, j, k."""
+    """Return the reservations of some intents."""
     query = select(reservations).where(reservations.c.intent.in_(sequences))
-    held = to_held(connection.execute(query).all())
-    i, j, k = airspace.grid.ijk(held.block).T
-    order = np.lexsort((k, j, i, held.enter_ms, held.sequence))
-    ends = np.searchsorted(held.sequence[order], sequences, side="right")
-    starts = np.searchsorted(held.sequence[order], sequences, side="left")
-    return {
-        sequence: Reservations(
-            held.block[order[start:end]], held.enter_ms[order[start:end]], held.exit_ms[order[start:end]]
-        )
-        for sequence, start, end in zip(sequences, starts, ends, strict=True)
-    }
+    return by_intent(to_held(connection.execute(query).all()), sequences, airspace.grid)
 
 
 def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:

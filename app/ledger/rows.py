@@ -9,8 +9,9 @@ import numpy as np
 import orjson
 from sqlalchemy import Row
 
+from app.errors import LedgerDamaged
 from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
-from planner.airmatrix import IntArray
+from planner.airmatrix import AirMatrix, IntArray
 from planner.airspace import Airspace
 
 
@@ -52,7 +53,16 @@ def to_row(intent: FlightIntent) -> dict[str, object]:
 
 
 def to_intent(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIntent:
-    """Return a row of `flight_intents` as an intent with these reservations."""
+    """Return a row of `flight_intents` as an intent with these reservations; `LedgerDamaged` if it makes no sense."""
+    try:
+        return _parsed(row, airspace, held)
+    except (ValueError, TypeError, KeyError) as error:
+        raise LedgerDamaged(
+            f"the ledger is damaged: flight intent {row.id}, sequence {row.sequence}, is unreadable: {error!r}"
+        ) from error
+
+
+def _parsed(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIntent:
     trajectory = refusal = None
     if row.trajectory is not None:
         trajectory = _load_trajectory(row.trajectory, row.unconstrained, airspace.terminal_dwell_ms)
@@ -87,6 +97,22 @@ def to_held(rows: Sequence[Row[Any]]) -> HeldReservations:
     """Return rows of `reservations` as columns."""
     columns = np.array([tuple(row) for row in rows], dtype=np.int64).reshape(-1, 4)
     return HeldReservations(columns[:, 0], columns[:, 1], columns[:, 2], columns[:, 3])
+
+
+def by_intent(held: HeldReservations, sequences: Sequence[int], grid: AirMatrix) -> dict[int, Reservations]:
+    """Return the reservations of each of these intents, sorted by enter, then i, j, k; none for who holds none."""
+    i, j, k = grid.ijk(held.block).T
+    order = np.lexsort((k, j, i, held.enter_ms, held.sequence))
+    owner = held.sequence[order]
+    parts = zip(
+        sequences, np.searchsorted(owner, sequences), np.searchsorted(owner, sequences, side="right"), strict=True
+    )
+    return {
+        sequence: Reservations(
+            held.block[order[start:end]], held.enter_ms[order[start:end]], held.exit_ms[order[start:end]]
+        )
+        for sequence, start, end in parts
+    }
 
 
 def columns_of(held: Reservations) -> tuple[IntArray, IntArray, IntArray]:

@@ -233,7 +233,7 @@ def test_occupancy_of_another_size_than_the_grids_is_refused() -> None:
 
 
 def test_a_negative_terminal_dwell_is_refused() -> None:
-    with pytest.raises(AirspaceFileError, match="dwell cannot be negative"):
+    with pytest.raises(AirspaceFileError, match="dwell must lie between 0 and an hour"):
         airspace(terminal_dwell_ms=-1)
 
 
