@@ -42,7 +42,7 @@ def verify(
 
 
 def _flights(book: Ledger) -> tuple[list[CheckedFlight], dict[State, int]]:
-    """Return all that holds or should hold reservations, as the checker sees it, and how many intents are in each state.
+    """Return all that holds or should hold reservations, as the checker sees it, and the number of intents by state.
 
     Reservations are read for themselves, not by way of the intents that should own them: those of a rejected or an
     absent intent are judged too, as a flight without a trajectory.
