@@ -160,11 +160,14 @@ class Deconfliction:
 
         return await self._enqueue(lambda tx, now: self._submit(tx, now, intent_id, submission, key), look_up)
 
-    async def preview(self, submission: Submission) -> PreviewPlan:
-        """Plan a submission, record nothing; raises as `submit`, and `NoPlan`."""
+    async def preview(self, submission: Submission) -> PreviewPlan | Refusal:
+        """Plan a submission, record nothing; raises as `submit`."""
 
-        def run(_: Transaction, now: int) -> PreviewPlan:
-            plan = self._plan(submission, now)
+        def run(transaction: Transaction, now: int) -> PreviewPlan | Refusal:
+            try:
+                plan = self._plan(submission, now)
+            except NoPlan as error:
+                return _refusal(error, transaction)
             return PreviewPlan(submission, Trajectory.of(plan), _reservations(plan))
 
         return await self._enqueue(run, lambda: None)

@@ -7,6 +7,9 @@ from app import auth, problems
 from app.errors import BodyTooLarge, HostNotAllowed, MalformedRequest, RequestError
 from app.settings import Settings
 
+# More digits than any length has.
+_LENGTH_DIGITS = 15
+
 
 class Gate:
     """ASGI middleware: without authentication only loopback hosts are served, and bodies are bounded and read whole."""
@@ -45,17 +48,23 @@ class Gate:
         limit = self._settings.max_body_bytes
         announced = Headers(scope=scope).get("content-length", "0")
         chunks: list[bytes] = []
-        size = int(announced) if announced.isdecimal() else 0
+        too_large = len(announced) > _LENGTH_DIGITS or (announced.isdecimal() and int(announced) > limit)
         received = 0
         more = True
-        while more and max(size, received) <= limit:
+        while more and not too_large:
             message = await receive()
             if message["type"] == "http.disconnect":
                 raise MalformedRequest("the connection ended within the body")
             chunk = message.get("body", b"")
             received += len(chunk)
+            too_large = received > limit
             chunks.append(chunk)
             more = message.get("more_body", False)
-        if max(size, received) > limit:
+        if too_large:
             raise BodyTooLarge(f"bodies may have up to {limit} bytes")
-        return b"".join(chunks)
+        body = b"".join(chunks)
+        try:
+            body.decode()
+        except UnicodeDecodeError as error:
+            raise MalformedRequest(f"the body is not UTF-8: {error.reason} at byte {error.start}") from error
+        return body

@@ -26,6 +26,9 @@ Times are RFC 3339 with an offset, answered in UTC with milliseconds. Errors are
 """
 
 
+_FASTAPI_VALIDATION = {"$ref": "#/components/schemas/HTTPValidationError"}
+
+
 class State(TypedDict):
     """What the lifespan hands to every request."""
 
@@ -75,8 +78,9 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             for operation in path.values():
                 for answer in operation["responses"].values():
                     content = answer.get("content", {})
-                    if content.get("application/json", {}).get("schema") == problem:
-                        content[problems.MEDIA_TYPE] = content.pop("application/json")
+                    if content.get("application/json", {}).get("schema") in (problem, _FASTAPI_VALIDATION):
+                        del content["application/json"]
+                        content[problems.MEDIA_TYPE] = {"schema": problem}
         for unused in ("HTTPValidationError", "ValidationError"):
             document["components"]["schemas"].pop(unused, None)
         app.openapi_schema = document

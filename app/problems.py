@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from app import errors
-from app.flight_intents import FlightIntent
+from app.flight_intents import FlightIntent, Refusal
 from app.times import format_time
 from planner.errors import NoPlan, NotPlannable
 
@@ -82,6 +82,10 @@ KINDS: dict[type[Exception], Kind] = {
 }  # fmt: skip
 
 VALIDATION = Kind("validation-error", 422, "Invalid request", "Correct what `errors` lists.")
+HTTP_ERRORS = {
+    404: Kind("not-found", 404, "Not found", "Check the path against /docs."),
+    405: Kind("method-not-allowed", 405, "Method not allowed", "Check the method against /docs; `Allow` names others."),
+}
 INTERNAL = Kind("internal-error", 500, "Internal error", "Report `error_id`; the log has the details.")
 
 
@@ -111,7 +115,7 @@ router = APIRouter(prefix="/problems", tags=["running it"])
 @router.get("/{slug}", summary="Explain a kind of problem")
 async def explain(slug: str) -> KindAnswer:
     """Say what a problem of this type means and what to do about it."""
-    for kind in (*KINDS.values(), VALIDATION, INTERNAL):
+    for kind in (*KINDS.values(), *HTTP_ERRORS.values(), VALIDATION, INTERNAL):
         if kind.slug == slug:
             return KindAnswer(type=f"/problems/{slug}", title=kind.title, status=kind.status, advice=kind.advice)
     raise HTTPException(404)
@@ -123,11 +127,6 @@ def kind_of(error: Exception) -> Kind:
         if cls in KINDS:
             return KINDS[cls]
     raise KeyError(type(error))
-
-
-def kind_of_status(status: int, title: str) -> Kind:
-    """Return the kind for an HTTP error that is no domain error, such as 404 for an unknown path."""
-    return Kind(title.lower().replace(" ", "-"), status, title, "Check method and path against /docs.")
 
 
 def body(kind: Kind, detail: str, members: Mapping[str, Any] | None = None) -> bytes:
@@ -160,16 +159,11 @@ def response_to(error: Exception) -> Response:
     return response(kind_of(error), str(error), members, headers)
 
 
-def refusal_body(intent: FlightIntent) -> bytes:
-    """Return the problem document of a recorded refusal."""
-    refusal = intent.refusal
-    assert refusal is not None
-    members: dict[str, Any] = {
-        "reason": refusal.reason,
-        "flight_intent_id": intent.id,
-        "sequence": intent.sequence,
-        "conflicting_intents": refusal.conflicting_intents,
-    }
+def refusal_body(refusal: Refusal, intent: FlightIntent | None = None) -> bytes:
+    """Return the problem document of a refusal, with the intent under which it is recorded, if it is."""
+    members: dict[str, Any] = {"reason": refusal.reason, "conflicting_intents": refusal.conflicting_intents}
+    if intent is not None:
+        members |= {"flight_intent_id": intent.id, "sequence": intent.sequence}
     if refusal.earliest_feasible_departure_ms is not None:
         members["earliest_feasible_departure"] = format_time(refusal.earliest_feasible_departure_ms)
     return body(KINDS[NoPlan], refusal.detail, members)
@@ -197,7 +191,7 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         if error.status_code == 400:
             return response(KINDS[errors.MalformedRequest], "the body cannot be parsed")
-        kind = kind_of_status(error.status_code, str(error.detail))
+        kind = HTTP_ERRORS[error.status_code]
         return response(kind, kind.advice, headers=error.headers)
 
     async def unexpected_error(request: Request, error: Exception) -> Response:

@@ -15,6 +15,9 @@ _RFC3339 = re.compile(
 )
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
+# The last millisecond that RFC 3339 can name.
+LATEST_MS = 253_402_300_799_999
+
 
 def now_ms() -> int:
     """Return the system clock."""
@@ -41,7 +44,10 @@ def parse_time(text: Any) -> int:
         raise ValueError(f"not a date and time: {error}") from error
     fraction = fraction or ""
     milliseconds = int(fraction[:3].ljust(3, "0")) + bool(fraction[3:].strip("0"))
-    return (moment - _EPOCH) // timedelta(milliseconds=1) + milliseconds
+    time_ms = (moment - _EPOCH) // timedelta(milliseconds=1) + milliseconds
+    if not 0 <= time_ms <= LATEST_MS:
+        raise ValueError("times must lie between the years 1970 and 9999, in UTC")
+    return time_ms
 
 
 def format_times(times_ms: IntArray) -> list[str]:

@@ -19,6 +19,8 @@ from planner.airspace import Airspace
 
 # "AMTX": marks a SQLite file as a ledger of ours.
 APPLICATION_ID = 0x414D5458
+# In a SQLite header: where it stands whether the database is in WAL mode, and how.
+_WRITE_VERSION, _WAL = 18, 2
 _BUSY_TIMEOUT_S = 10
 # As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
 _READERS = 40
@@ -42,9 +44,7 @@ def create_or_upgrade(location: str) -> str:
     path = sqlite_path(location)
     if not path.parent.is_dir():
         raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
-    if path.exists() and path.stat().st_size > 0:
-        _check_is_ledger(path)
-    else:
+    if not (path.exists() and path.stat().st_size > 0) or _check_is_ledger(path)[_WRITE_VERSION] != _WAL:
         _mark(path)
     engine = _engine(path, writes=True)
     try:
@@ -128,8 +128,8 @@ def _mark(path: Path) -> None:
         raise StartupError(f"cannot create ledger {path}: {error}") from error
 
 
-def _check_is_ledger(path: Path) -> None:
-    """Look at the file's header only: SQLite itself may write beside a database that it merely opens."""
+def _check_is_ledger(path: Path) -> bytes:
+    """Return the file's header. Nothing else is looked at: SQLite itself may write beside a database that it merely opens."""
     try:
         with path.open("rb") as file:
             header = file.read(100)
@@ -139,6 +139,7 @@ def _check_is_ledger(path: Path) -> None:
         raise ForeignLedger(f"{path} is not an AirMatrix ledger; nothing was changed in it")
     if int.from_bytes(header[68:72]) != APPLICATION_ID:
         raise ForeignLedger(f"{path} is a SQLite database, but not an AirMatrix ledger; nothing was changed in it")
+    return header
 
 
 def _schema(connection: Connection, path: Path) -> str | None:

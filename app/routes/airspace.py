@@ -14,7 +14,7 @@ from app.block_status import BlockStatus, Status, statuses
 from app.errors import UnknownBlock
 from app.routes.flight_intents import BlockIndices
 from app.service import Service, ServiceDep
-from app.times import Moment, Timestamp, format_time
+from app.times import LATEST_MS, Moment, Timestamp, format_time
 from planner.airmatrix import AirMatrix
 from planner.airspace import building_feature
 
@@ -22,8 +22,6 @@ router = APIRouter(prefix="/v1/airspace", tags=["airspace"])
 
 GEOJSON = "application/geo+json"
 _DEFAULT_SPAN_MS = 3_600_000
-# Times beyond the years 1970 to 9999 are refused where they are parsed; this is the far end of "all there is".
-_END_OF_TIME_MS = 253_402_300_799_999
 
 Layer = Annotated[int | None, Query(ge=0, description="Layer k, zero-based; all layers by default.")]
 Index = Annotated[int, Path(ge=0)]
@@ -269,7 +267,7 @@ def read_block(
         raise UnknownBlock(f"there is no block {[i, j, k]}; the airspace has {list(grid.dimensions)} blocks")
     block = grid.index((i, j, k))
     now_ms = service.clock()
-    from_ms, to_ms = _span(now_ms if from_ is None else from_, _END_OF_TIME_MS if to is None else to)
+    from_ms, to_ms = _span(now_ms if from_ is None else from_, LATEST_MS if to is None else to)
     held = service.ledger.held_between(from_ms, to_ms, block)
     ids = service.ledger.ids(held.sequence.tolist())
     present = statuses(service.ledger.held_between(now_ms, now_ms + 1, block))

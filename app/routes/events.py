@@ -37,7 +37,8 @@ def list_events(
     limit: Annotated[int, Query(ge=1, le=paging.LIMIT)] = 100,
 ) -> EventPage:
     """Return the changes after a revision, oldest first. Revisions have no gaps."""
-    entries = service.ledger.journal_after(after, limit)
+    # One more than asked for: whether there is another page.
+    entries = service.ledger.journal_after(after, limit + 1)
     items = [
         Event(
             revision=entry.revision,
@@ -46,6 +47,6 @@ def list_events(
             flight_intent_id=entry.intent_id,
             sequence=entry.sequence,
         )
-        for entry in entries
+        for entry in entries[:limit]
     ]
-    return EventPage(items=items, next_cursor=str(items[-1].revision) if len(items) == limit else None)
+    return EventPage(items=items, next_cursor=str(items[-1].revision) if len(entries) > limit else None)

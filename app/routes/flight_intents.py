@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from app import problems
 from app.deconfliction import IdempotencyKey, Outcome
 from app.errors import PriorityNotSupported, UnknownAircraftType, UnknownFlightIntent
-from app.flight_intents import FlightIntent, Position, Reservations, State, Submission, Trajectory
+from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
 from app.routes import paging
 from app.service import Service, ServiceDep
 from app.times import Moment, Timestamp, format_time, format_times
@@ -179,6 +179,8 @@ async def submit(
 async def preview(service: ServiceDep, body: FlightIntentBody) -> Response:
     """Answer what submitting this body would give at this moment; nothing is reserved or recorded."""
     plan = await service.deconfliction.preview(_located(service, body))
+    if isinstance(plan, Refusal):
+        return Response(problems.refusal_body(plan), problems.KINDS[NoPlan].status, media_type=problems.MEDIA_TYPE)
     answer = _planned(service.airspace.grid, "preview", plan.submission, plan.trajectory, plan.reservations)
     return Response(orjson.dumps(answer), media_type="application/json")
 
@@ -201,11 +203,13 @@ def list_flight_intents(
     cursor: str | None = None,
 ) -> Response:
     """List intents in their order of arrival. Refused ones count with their departure window."""
-    intents = service.ledger.page(
-        after_sequence=paging.decode(cursor), limit=limit, operator=operator, state=state, from_ms=from_, to_ms=to
+    # One more than asked for: whether there is another page.
+    found = service.ledger.page(
+        after_sequence=paging.decode(cursor), limit=limit + 1, operator=operator, state=state, from_ms=from_, to_ms=to
     )
+    intents = found[:limit]
     items = [render(service.airspace.grid, intent) for intent in intents]
-    next_cursor = paging.encode(intents[-1].sequence) if len(intents) == limit else None
+    next_cursor = paging.encode(intents[-1].sequence) if len(found) > limit else None
     return Response(orjson.dumps({"items": items, "next_cursor": next_cursor}), media_type="application/json")
 
 
@@ -345,7 +349,7 @@ def _reservations(grid: AirMatrix, held: Reservations) -> list[dict[str, Any]]:
 
 def _outcome_body(service: Service, outcome: Outcome) -> bytes:
     if outcome.intent.refusal is not None:
-        return problems.refusal_body(outcome.intent)
+        return problems.refusal_body(outcome.intent.refusal, outcome.intent)
     return orjson.dumps(render(service.airspace.grid, outcome.intent))
 
 

@@ -1,0 +1,58 @@
+"""What operators post, for the districts of the tests."""
+
+from dataclasses import asdict
+from typing import Any
+
+import httpx
+
+from app.problems import MEDIA_TYPE
+from app.times import format_time
+from planner.errors import Block
+from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, OLD_TOWN, District
+
+SUBMIT = "/v1/flight-intents"
+PREVIEW = "/v1/flight-intents/preview"
+
+FLIGHT_INTENT = {
+    "id", "sequence", "version", "state", "operator", "reference", "aircraft_type", "priority", "origin", "destination",
+    "earliest_departure", "latest_departure", "departure", "arrival", "flight_time_s", "ground_hold_s", "hover_s",
+    "delay_s", "trajectory", "reservations",
+}  # fmt: skip
+PREVIEWED = FLIGHT_INTENT - {"id", "sequence", "version"}
+PLANNED = {"departure", "arrival", "flight_time_s", "ground_hold_s", "hover_s", "delay_s"}
+PROBLEM = {"type", "title", "status", "detail"}
+
+
+def intent(
+    origin: str | Block = "A",
+    destination: str | Block = "B",
+    /,
+    *,
+    district: District = OLD_TOWN,
+    earliest_ms: int = DEPARTURE_MS,
+    window_ms: int | None = None,
+    **members: Any,
+) -> dict[str, Any]:
+    """Return the body of a flight intent; without `window_ms`, without latest departure."""
+    body = {
+        "operator": "acme-air",
+        "aircraft_type": AIRCRAFT,
+        "origin": asdict(district.centre(origin)),
+        "destination": asdict(district.centre(destination)),
+        "earliest_departure": format_time(earliest_ms),
+    }
+    if window_ms is not None:
+        body["latest_departure"] = format_time(earliest_ms + window_ms)
+    return {**body, **members}
+
+
+def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
+    """Return a response's problem document, after checking that it is this one."""
+    document: dict[str, Any] = response.json()
+    assert (response.status_code, document["type"]) == (status, f"/problems/{slug}"), document
+    assert response.headers["content-type"] == MEDIA_TYPE
+    assert set(document) >= PROBLEM
+    assert document["status"] == status
+    assert document["title"]
+    assert document["detail"]
+    return document

@@ -1,0 +1,177 @@
+"""One process's worth of the service without HTTP, so that tests can run several on one ledger."""
+
+import asyncio
+import sqlite3
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any, Self
+
+from app.deconfliction import Deconfliction, IdempotencyKey, Outcome, Policy
+from app.flight_intents import FlightIntent, Submission
+from app.ledger import create_or_upgrade, open_ledger
+from planner.aircraft import shipped_aircraft_types
+from planner.airspace import Airspace
+from planner.cfa_star import Performance, Planner, Search
+from planner.kernels import intervals
+from tests.ledger.district import START_MS
+
+Hold = tuple[int, int, int]  # block, enter, exit
+
+DAY_MS = 86_400_000
+POLICY = Policy(horizon_ms=30 * DAY_MS, idempotency_ms=DAY_MS, queue_limit=1024)
+
+
+@dataclass
+class FakeClock:
+    """A clock that stands still until it is told."""
+
+    now_ms: int = START_MS
+
+    def __call__(self) -> int:
+        """Return the time."""
+        return self.now_ms
+
+    def advance(self, *, seconds: float = 0, ms: int = 0) -> None:
+        """Let time pass."""
+        self.now_ms += round(seconds * 1000) + ms
+
+
+@cache
+def migrated_ledger() -> bytes:
+    """Return the bytes of a new ledger at the newest schema, so that tests need not migrate one each."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "ledger.sqlite"
+        create_or_upgrade(str(path))
+        return path.read_bytes()
+
+
+class Process:
+    """Ledger connections, planner, index and writer on one ledger file, which is created if absent."""
+
+    def __init__(
+        self,
+        path: Path,
+        airspace: Airspace,
+        clock: Callable[[], int],
+        *,
+        policy: Policy = POLICY,
+        search: Search = Search.SAFE_INTERVAL,
+    ) -> None:
+        if not path.exists():
+            path.write_bytes(migrated_ledger())
+        self.path = path
+        self.ledger = open_ledger(str(path), airspace, claim=True)
+        self.planner = Planner(airspace, search)
+        performances = {type_.id: Performance.of(type_, airspace.grid) for type_ in shipped_aircraft_types()}
+        self.deconfliction = Deconfliction(self.ledger, self.planner, performances, clock, policy)
+        self.deconfliction.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.deconfliction.stop()
+        self.ledger.close()
+
+    def submit(self, submission: Submission, key: IdempotencyKey | None = None) -> FlightIntent:
+        """Return what is recorded of a submission."""
+        return asyncio.run(self.deconfliction.submit(submission, key)).intent
+
+    def cancel(self, intent: FlightIntent) -> FlightIntent:
+        """Cancel an intent."""
+        return asyncio.run(self.deconfliction.cancel(intent.id))
+
+    def together(self, *requests: Coroutine[Any, Any, Any]) -> list[Any]:
+        """Return the answers, or errors, of requests that have to be written as one batch."""
+        return asyncio.run(self._together(requests))
+
+    async def _together(self, requests: tuple[Coroutine[Any, Any, Any], ...]) -> list[Any]:
+        with write_lock(self.path):
+            tasks = [asyncio.create_task(request) for request in requests]
+            await until(lambda: self.deconfliction.waiting == len(requests) - 1)
+        return await asyncio.gather(*tasks, return_exceptions=True)
+
+    def indexed(self, now_ms: int) -> dict[Hold, int]:
+        """Return the reservations of the index that end after `now_ms`, with the sequence numbers of their intents."""
+        table, pool, _ = self.planner.index.slabs
+        held = {}
+        for block, (first, count) in enumerate(table[:, : intervals.SIZE_CLASS].tolist()):
+            for enter, leave, owner in pool[first : first + count].tolist() if count else ():
+                if leave > now_ms:
+                    held[block, enter, leave] = owner
+        return held
+
+
+def outcomes(process: Process, *submissions: Submission) -> list[Outcome | BaseException]:
+    """Submit in one batch; return outcomes and errors."""
+    return process.together(*(process.deconfliction.submit(submission) for submission in submissions))
+
+
+async def until(reached: Callable[[], bool]) -> None:
+    """Wait for another thread."""
+    deadline = time.monotonic() + 10
+    while not reached():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.001)
+
+
+@contextmanager
+def database(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a ledger as a stranger would; foreign keys are not enforced."""
+    connection = sqlite3.connect(path, isolation_level=None, timeout=10)
+    try:
+        yield connection
+    finally:
+        connection.close()
+
+
+@contextmanager
+def write_lock(path: Path) -> Iterator[None]:
+    """Hold the write lock of a ledger."""
+    with database(path) as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        yield
+        connection.execute("COMMIT")
+
+
+def reserved(path: Path, after_ms: int = 0) -> dict[Hold, int]:
+    """Return the ledger's reservations that end after a time, with the sequence numbers of their intents."""
+    with database(path) as connection:
+        rows = connection.execute('SELECT block, enter, "exit", intent FROM reservations WHERE "exit" > ?', [after_ms])
+        return {(block, enter, leave): intent for block, enter, leave, intent in rows}
+
+
+def assert_no_overlaps(path: Path) -> None:
+    """Fail if two reservations of a block overlap, or one is empty."""
+    holds = sorted(reserved(path))
+    for (block, _, leave), (other_block, enter, _) in pairwise(holds):
+        assert block != other_block or leave <= enter
+    assert all(enter < leave for _, enter, leave in holds)
+
+
+def assert_gapless(path: Path) -> None:
+    """Fail if a sequence number or revision is missing, or the counters lag behind."""
+    with database(path) as connection:
+        sequences = [row[0] for row in connection.execute("SELECT sequence FROM flight_intents ORDER BY sequence")]
+        revisions = [row[0] for row in connection.execute("SELECT revision FROM journal ORDER BY revision")]
+        counters = connection.execute("SELECT sequence, revision FROM counters").fetchone()
+    assert sequences == list(range(1, len(sequences) + 1))
+    assert revisions == list(range(1, len(revisions) + 1))
+    assert counters == (len(sequences), len(revisions))
+
+
+def assert_journal_tells_states(path: Path) -> None:
+    """Fail unless every intent's state and version are those of its newest journal entry."""
+    with database(path) as connection:
+        states = dict(connection.execute("SELECT sequence, state || version FROM flight_intents").fetchall())
+        newest = dict(connection.execute("SELECT intent, kind || revision FROM journal ORDER BY revision").fetchall())
+    assert states == newest

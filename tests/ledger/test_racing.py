@@ -1,0 +1,156 @@
+"""Two processes on one ledger, each with an index of its own: the write lock and the journal keep them in step."""
+
+import asyncio
+import random
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from app.errors import IllegalTransition
+from app.flight_intents import FlightIntent, State
+from tests.ledger.district import SQUARE, START_MS, STREET
+from tests.ledger.process import (
+    FakeClock,
+    Process,
+    assert_gapless,
+    assert_journal_tells_states,
+    assert_no_overlaps,
+    reserved,
+)
+from tests.ledger.test_restart import described, random_submission
+
+
+@pytest.fixture
+def pair(ledger_path: Path, clock: FakeClock) -> Iterator[tuple[Process, Process]]:
+    with (
+        Process(ledger_path, STREET.airspace, clock) as one,
+        Process(ledger_path, STREET.airspace, clock) as other,
+    ):
+        yield one, other
+
+
+def at_once(*work: Callable[[], None]) -> None:
+    """Do work in threads that start together; fail if one fails."""
+    errors: list[BaseException] = []
+    barrier = threading.Barrier(len(work))
+
+    def run(task: Callable[[], None]) -> None:
+        try:
+            barrier.wait()
+            task()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=run, args=[task]) for task in work]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+
+
+def test_a_process_sees_what_another_reserved(pair: tuple[Process, Process]) -> None:
+    one, other = pair
+    first = one.submit(STREET.submission("W", "E"))
+    refused = other.submit(STREET.submission("E", "W", window_ms=0))
+    assert refused.refusal is not None
+    assert (first.sequence, refused.sequence, refused.refusal.reason) == (1, 2, "no_conflict_free_path")
+
+
+def test_a_process_sees_what_another_cancelled(pair: tuple[Process, Process]) -> None:
+    one, other = pair
+    first = one.submit(STREET.submission("W", "E"))
+    other.cancel(first)
+    again = one.submit(STREET.submission("W", "E", window_ms=0))
+    assert described(again)[2:] == described(first)[2:]  # type: ignore[index]
+
+
+def test_a_process_sees_space_that_another_freed_and_gave_away_again(pair: tuple[Process, Process]) -> None:
+    one, other = pair
+    first = one.submit(STREET.submission("W", "E"))
+    other.cancel(first)
+    second = other.submit(STREET.submission("W", "E"))
+    third = one.submit(STREET.submission("W", "E"))
+    assert third.trajectory is not None
+    assert second.trajectory is not None
+    assert third.trajectory.departure_ms > second.trajectory.departure_ms
+    assert_no_overlaps(one.path)
+
+
+def test_a_process_keeps_what_a_flight_holds_that_another_cancelled_in_the_air(
+    pair: tuple[Process, Process], clock: FakeClock
+) -> None:
+    one, other = pair
+    first = one.submit(STREET.submission("W", "E"))
+    clock.advance(seconds=61)
+    other.cancel(first)
+    other.submit(STREET.submission("E", "W"))
+    one.submit(STREET.submission("E", "W"))
+    assert one.indexed(clock.now_ms) == reserved(one.path, clock.now_ms)
+
+
+@pytest.mark.compiled
+def test_a_process_that_lags_far_behind_catches_up(ledger_path: Path, clock: FakeClock) -> None:
+    with (
+        Process(ledger_path, SQUARE.airspace, clock) as one,
+        Process(ledger_path, SQUARE.airspace, clock) as other,
+    ):
+
+        async def submit_many() -> None:
+            spread = [SQUARE.submission("N", "S", earliest_ms=START_MS + 600_000 * n) for n in range(1001)]
+            await asyncio.gather(*(one.deconfliction.submit(submission) for submission in spread))
+
+        asyncio.run(submit_many())
+        assert other.submit(SQUARE.submission("N", "S")).version == 1002
+        assert other.indexed(clock.now_ms) == reserved(ledger_path)
+    assert_no_overlaps(ledger_path)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("seed", range(3))
+def test_racing_processes_never_overlap_and_leave_no_gaps(seed: int, ledger_path: Path, clock: FakeClock) -> None:
+    with (
+        Process(ledger_path, SQUARE.airspace, clock) as one,
+        Process(ledger_path, SQUARE.airspace, clock) as other,
+    ):
+
+        def operator(process: Process, number: int) -> Callable[[], None]:
+            def fly() -> None:
+                chance = random.Random(10 * seed + number)
+                mine: list[FlightIntent] = []
+                for _ in range(25):
+                    mine.append(process.submit(random_submission(SQUARE, chance, START_MS)))
+                    if chance.random() < 0.4:
+                        with suppress(IllegalTransition):
+                            (other if process is one else one).cancel(mine.pop(chance.randrange(len(mine))))
+
+            return fly
+
+        at_once(*(operator(process, number) for number, process in enumerate((one, other, one, other))))
+        assert one.ledger.count() == 100
+        assert {intent.state for intent in one.ledger.all_intents()} >= {State.ACCEPTED, State.CANCELLED}
+        assert_no_overlaps(ledger_path)
+        assert_gapless(ledger_path)
+        assert_journal_tells_states(ledger_path)
+        for process in (one, other):
+            process.submit(SQUARE.submission("N", "S", earliest_ms=START_MS + 86_400_000))
+        one.submit(SQUARE.submission("N", "S", earliest_ms=START_MS + 86_400_000))
+        assert one.indexed(0) == reserved(ledger_path)
+
+
+def test_processes_with_different_clocks_never_overlap(ledger_path: Path) -> None:
+    early, late = FakeClock(), FakeClock(START_MS + 120_000)
+    with (
+        Process(ledger_path, STREET.airspace, early) as one,
+        Process(ledger_path, STREET.airspace, late) as other,
+    ):
+        for n in range(12):
+            process = (one, other)[n % 2]
+            process.submit(STREET.submission("WE"[n % 2], "EW"[n % 2], window_ms=900_000))
+            early.advance(seconds=11)
+            late.advance(seconds=11)
+    assert_no_overlaps(ledger_path)
+    assert_gapless(ledger_path)

@@ -1,0 +1,584 @@
+"""The one writer: order, batches, isolation of neighbours, failures of the database, cancellation."""
+
+import asyncio
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Connection, Engine, event
+from sqlalchemy.exc import OperationalError
+
+from app.deconfliction import IdempotencyKey, Outcome, Policy
+from app.errors import (
+    BeyondHorizon,
+    DepartureInThePast,
+    IdempotencyKeyReused,
+    IllegalTransition,
+    LedgerUnavailable,
+    QueueFull,
+    UnknownFlightIntent,
+)
+from app.flight_intents import FlightIntent, Reservations, State
+from tests.ledger.district import DEPARTURE_MS, SQUARE, START_MS, STREET
+from tests.ledger.process import (
+    DAY_MS,
+    POLICY,
+    FakeClock,
+    Hold,
+    Process,
+    assert_gapless,
+    assert_journal_tells_states,
+    assert_no_overlaps,
+    database,
+    outcomes,
+    reserved,
+    until,
+    write_lock,
+)
+
+
+@pytest.fixture
+def street(ledger_path: Path, clock: FakeClock) -> Iterator[Process]:
+    with Process(ledger_path, STREET.airspace, clock) as process:
+        yield process
+
+
+@pytest.fixture
+def square(ledger_path: Path, clock: FakeClock) -> Iterator[Process]:
+    with Process(ledger_path, SQUARE.airspace, clock) as process:
+        yield process
+
+
+THREE_DAYS_MS = 3 * DAY_MS
+
+
+def held(intent: FlightIntent) -> set[Hold]:
+    """Return an intent's reservations."""
+    columns: Reservations = intent.reservations
+    return set(zip(columns.block.tolist(), columns.enter_ms.tolist(), columns.exit_ms.tolist(), strict=True))
+
+
+def departure(intent: FlightIntent) -> int:
+    assert intent.trajectory is not None
+    return intent.trajectory.departure_ms
+
+
+def arrival(intent: FlightIntent) -> int:
+    assert intent.trajectory is not None
+    return intent.trajectory.arrival_ms
+
+
+def key(name: str, digest: str = "one body") -> IdempotencyKey:
+    """Return a key whose answers are rendered as their sequence numbers."""
+    return IdempotencyKey(name, digest, lambda outcome: str(outcome.intent.sequence).encode())
+
+
+def submit(process: Process, digest: str = "one body", name: str = "key", **request: object) -> Outcome:
+    """Submit a flight across the square with an idempotency key."""
+    submission = SQUARE.submission("N", "S", **request)  # type: ignore[arg-type]
+    return asyncio.run(process.deconfliction.submit(submission, key(name, digest)))
+
+
+def assert_sound(process: Process, now_ms: int = 0) -> None:
+    """Fail unless table, index, counters and journal agree and nothing overlaps."""
+    assert_no_overlaps(process.path)
+    assert_gapless(process.path)
+    assert_journal_tells_states(process.path)
+    assert process.indexed(now_ms) == reserved(process.path, now_ms)
+
+
+# Order and numbers
+
+
+def test_sequence_and_version_count_from_one(square: Process) -> None:
+    intents = [square.submit(SQUARE.submission("N", "S")) for _ in range(3)]
+    assert [(intent.sequence, intent.version) for intent in intents] == [(1, 1), (2, 2), (3, 3)]
+
+
+def test_a_refusal_takes_a_sequence_number(street: Process) -> None:
+    street.submit(STREET.submission("W", "E"))
+    refused = street.submit(STREET.submission("W", "E", window_ms=0))
+    accepted = street.submit(STREET.submission("W", "E"))
+    assert [(refused.sequence, refused.state), (accepted.sequence, accepted.state)] == [
+        (2, State.REJECTED),
+        (3, State.ACCEPTED),
+    ]
+
+
+def test_a_cancellation_takes_a_revision_but_no_sequence_number(square: Process) -> None:
+    cancelled = square.cancel(square.submit(SQUARE.submission("N", "S")))
+    second = square.submit(SQUARE.submission("N", "S"))
+    assert (cancelled.sequence, cancelled.version) == (1, 2)
+    assert (second.sequence, second.version) == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("earliest_ms", "window_ms", "error"),
+    [
+        (START_MS - 2, 1, DepartureInThePast),
+        (START_MS, POLICY.horizon_ms + 1, BeyondHorizon),
+        (START_MS + POLICY.horizon_ms + 1, 0, BeyondHorizon),
+    ],
+)
+def test_a_request_outside_the_horizon_takes_no_number(
+    square: Process, earliest_ms: int, window_ms: int, error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        square.submit(SQUARE.submission("N", "S", earliest_ms=earliest_ms, window_ms=window_ms))
+    assert square.ledger.count() == 0
+    assert square.ledger.revision() == 0
+
+
+@pytest.mark.parametrize(("earliest_ms", "window_ms"), [(START_MS - 2, 2), (START_MS, POLICY.horizon_ms)])
+def test_the_first_and_the_last_moment_of_the_horizon_are_accepted(
+    square: Process, earliest_ms: int, window_ms: int
+) -> None:
+    intent = square.submit(SQUARE.submission("N", "S", earliest_ms=earliest_ms, window_ms=window_ms))
+    assert (intent.state, departure(intent)) == (State.ACCEPTED, START_MS)
+
+
+def test_requests_that_wait_together_are_planned_in_the_order_of_their_arrival(street: Process) -> None:
+    answers = outcomes(street, *[STREET.submission("W", "E", operator=f"operator-{n}") for n in range(5)])
+    intents = [answer.intent for answer in answers if isinstance(answer, Outcome)]
+    assert [intent.sequence for intent in intents] == [1, 2, 3, 4, 5]
+    assert [departure(intent) for intent in intents] == sorted(departure(intent) for intent in intents)
+    assert_sound(street)
+
+
+def test_requests_that_wait_together_are_committed_once(street: Process) -> None:
+    commits: list[Connection] = []
+    with on_commit(commits.append):
+        outcomes(street, *[STREET.submission("W", "E") for _ in range(5)])
+    # The first request is in its transaction already when the others come.
+    assert len(commits) == 1
+
+
+def test_everything_in_a_batch_has_one_now(ledger_path: Path) -> None:
+    ticking = FakeClock()
+
+    def clock() -> int:
+        ticking.advance(ms=7)
+        return ticking.now_ms
+
+    with Process(ledger_path, SQUARE.airspace, clock) as process:
+        answers = outcomes(process, *[SQUARE.submission("N", "S") for _ in range(3)])
+    assert len({answer.intent.received_ms for answer in answers if isinstance(answer, Outcome)}) == 1
+
+
+def test_nothing_is_planned_before_a_moment_that_has_been_now(square: Process, clock: FakeClock) -> None:
+    clock.advance(seconds=100)
+    square.submit(SQUARE.submission("N", "S"))
+    clock.advance(seconds=-50)
+    intent = square.submit(SQUARE.submission("S", "N"))
+    assert departure(intent) >= START_MS + 100_000
+
+
+# Previews
+
+
+def test_a_preview_is_the_plan_that_a_submission_gets_next(street: Process) -> None:
+    street.submit(STREET.submission("W", "E"))
+    preview = asyncio.run(street.deconfliction.preview(STREET.submission("W", "E")))
+    intent = street.submit(STREET.submission("W", "E"))
+    assert intent.trajectory is not None
+    for column in ("block", "arrive_ms", "depart_ms"):
+        assert getattr(preview.trajectory, column).tolist() == getattr(intent.trajectory, column).tolist()
+    for column in ("block", "enter_ms", "exit_ms"):
+        assert getattr(preview.reservations, column).tolist() == getattr(intent.reservations, column).tolist()
+
+
+def test_a_preview_leaves_ledger_and_index_as_they_were(street: Process) -> None:
+    asyncio.run(street.deconfliction.preview(STREET.submission("W", "E")))
+    assert (street.ledger.count(), street.ledger.revision()) == (0, 0)
+    assert street.indexed(0) == {}
+
+
+# Neighbours in a batch
+
+
+def reserve_secretly(path: Path, holds: set[Hold], sequence: int) -> None:
+    """Insert reservations as somebody would who knows nothing of the journal."""
+    with database(path) as connection:
+        connection.executemany("INSERT INTO reservations VALUES (?, ?, ?, ?)", [(*hold, sequence) for hold in holds])
+
+
+def test_a_request_that_the_database_refuses_harms_no_neighbour_in_its_batch(square: Process) -> None:
+    # Somebody has reserved the corner S without telling: N -> S fails, the flights beside it do not.
+    first = square.submit(SQUARE.submission("N", (1, 2, 0)))
+    reserve_secretly(square.path, {(SQUARE.block("S"), START_MS, START_MS + 3_600_000)}, first.sequence)
+    before, refused, after = outcomes(
+        square,
+        SQUARE.submission((0, 0, 0), (1, 0, 0)),
+        SQUARE.submission("N", "S"),
+        SQUARE.submission((1, 0, 0), (0, 0, 0)),
+    )
+    assert isinstance(before, Outcome)
+    assert isinstance(after, Outcome)
+    assert [before.intent.sequence, after.intent.sequence] == [2, 3]
+    assert isinstance(refused, LedgerUnavailable)
+    assert square.ledger.count() == 3
+    assert_sound(square)
+
+
+def test_after_a_refusal_by_the_database_the_next_plan_avoids_what_the_index_had_missed(square: Process) -> None:
+    first = square.submit(SQUARE.submission("N", (1, 2, 0)))
+    secret = (SQUARE.block((1, 1, 0)), START_MS + 600_000, START_MS + 700_000)
+    reserve_secretly(square.path, {secret}, first.sequence)
+    there = SQUARE.submission((1, 0, 0), (1, 1, 0), earliest_ms=START_MS + 600_000, window_ms=600_000)
+    with pytest.raises(LedgerUnavailable):
+        square.submit(there)
+    again = square.submit(there)
+    # It arrives, and then stays no longer; its first moment there is the first free one.
+    (entered,) = [enter for block, enter, _ in held(again) if block == secret[0]]
+    assert entered == secret[2]
+    assert_sound(square)
+
+
+# A database that fails
+
+
+@contextmanager
+def on_commit(handler: Callable[[Connection], object]) -> Iterator[None]:
+    """Call a handler with each writing connection that is about to commit."""
+
+    def listener(connection: Connection) -> None:
+        if connection.exec_driver_sql("PRAGMA query_only").scalar() == 0:
+            handler(connection)
+
+    event.listen(Engine, "commit", listener)
+    try:
+        yield
+    finally:
+        event.remove(Engine, "commit", listener)
+
+
+def fail(connection: Connection) -> None:
+    """Fail instead of committing."""
+    del connection
+    raise OperationalError("COMMIT", {}, sqlite3.OperationalError("disk I/O error"))
+
+
+def commit_and_fail(connection: Connection) -> None:
+    """Commit, and then lose the connection."""
+    connection.connection.commit()
+    fail(connection)
+
+
+def test_requests_whose_commit_failed_are_told_that_nothing_was_recorded(square: Process) -> None:
+    square.submit(SQUARE.submission("N", "S"))
+    with on_commit(fail):
+        answers = outcomes(square, *[SQUARE.submission("N", "S") for _ in range(3)])
+    assert [type(answer) for answer in answers] == [LedgerUnavailable] * 3
+    assert square.ledger.count() == 1
+
+
+def test_after_a_commit_that_failed_the_service_goes_on_as_if_it_had_not_been_tried(square: Process) -> None:
+    first = square.submit(SQUARE.submission("N", "S"))
+    with on_commit(fail), pytest.raises(LedgerUnavailable):
+        square.submit(SQUARE.submission("N", "S"))
+    second = square.submit(SQUARE.submission("S", "N"))
+    assert [first.sequence, second.sequence] == [1, 2]
+    assert_sound(square)
+
+
+def test_requests_whose_commit_was_lost_after_it_happened_are_answered_from_the_ledger(street: Process) -> None:
+    with on_commit(commit_and_fail):
+        answers = outcomes(street, STREET.submission("W", "E", window_ms=0), STREET.submission("W", "E", window_ms=0))
+    accepted, refused = (answer.intent for answer in answers if isinstance(answer, Outcome))
+    assert (accepted.sequence, accepted.state, held(accepted)) == (1, State.ACCEPTED, set(reserved(street.path)))
+    assert refused.refusal is not None
+    assert (refused.sequence, refused.refusal.reason) == (2, "no_departure_slot")
+    assert refused.refusal.conflicting_intents == (accepted.id,)
+
+
+def test_after_a_commit_that_was_lost_the_service_goes_on_with_what_it_did(street: Process) -> None:
+    with on_commit(commit_and_fail):
+        street.submit(STREET.submission("W", "E"))
+    second = street.submit(STREET.submission("W", "E"))
+    assert second.sequence == 2
+    assert_sound(street)
+
+
+def test_a_cancellation_whose_commit_was_lost_is_answered_from_the_ledger(square: Process) -> None:
+    intent = square.submit(SQUARE.submission("N", "S"))
+    with on_commit(commit_and_fail):
+        cancelled = square.cancel(intent)
+    assert (cancelled.state, cancelled.version) == (State.CANCELLED, 2)
+    assert_sound(square)
+
+
+def test_a_cancellation_whose_commit_failed_has_not_happened(square: Process) -> None:
+    intent = square.submit(SQUARE.submission("N", "S"))
+    with on_commit(fail), pytest.raises(LedgerUnavailable):
+        square.cancel(intent)
+    found = square.ledger.find(intent.id)
+    assert found is not None
+    assert (found.state, held(found)) == (State.ACCEPTED, held(intent))
+    square.submit(SQUARE.submission("S", "N"))
+    assert_sound(square)
+
+
+def test_a_repetition_whose_commit_was_lost_is_answered_with_the_first_answer(square: Process) -> None:
+    first = submit(square)
+    with on_commit(commit_and_fail):
+        again = submit(square)
+    assert (again.intent.id, again.replayed) == (first.intent.id, b"1")
+
+
+def test_a_full_disk_fails_the_whole_batch_and_leaves_nothing_of_it(square: Process) -> None:
+    square.submit(SQUARE.submission("N", "S"))
+    small = SQUARE.submission("N", "S")
+    too_big = replace(small, reference="x" * 1_000_000)
+
+    def no_more_pages(connection: Connection) -> None:
+        connection.exec_driver_sql("PRAGMA max_page_count = 1")
+
+    event.listen(Engine, "begin", no_more_pages)
+    try:
+        answers = outcomes(square, small, too_big)
+    finally:
+        event.remove(Engine, "begin", no_more_pages)
+    assert [type(answer) for answer in answers] == [LedgerUnavailable] * 2
+    assert square.ledger.count() == 1
+    assert square.submit(SQUARE.submission("S", "N")).sequence == 2
+    assert_sound(square)
+
+
+def test_an_unexpected_error_in_one_request_harms_neither_its_neighbours_nor_the_writer(square: Process) -> None:
+    class Surprise(Exception):
+        pass
+
+    def render(_: Outcome) -> bytes:
+        raise Surprise
+
+    bad = IdempotencyKey("key", "digest", render)
+    before, surprised, after = square.together(
+        square.deconfliction.submit(SQUARE.submission("N", "S")),
+        square.deconfliction.submit(SQUARE.submission("N", "S"), bad),
+        square.deconfliction.submit(SQUARE.submission("S", "N")),
+    )
+    assert isinstance(surprised, Surprise)
+    assert [before.intent.sequence, after.intent.sequence] == [1, 2]
+    assert_sound(square)
+
+
+# Requests that are given up
+
+
+def test_a_request_that_is_given_up_while_it_is_planned_does_not_stop_the_writer(square: Process) -> None:
+    async def give_up() -> Outcome:
+        with write_lock(square.path):
+            given_up = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
+            last = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("S", "N")))
+            await until(lambda: square.deconfliction.waiting == 1)
+            given_up.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await given_up
+        return await asyncio.wait_for(last, timeout=2)
+
+    assert asyncio.run(give_up()).intent.sequence == 2
+    assert square.deconfliction.is_running
+    assert_sound(square)
+
+
+def test_a_request_that_is_given_up_in_the_queue_does_not_stop_the_writer(square: Process) -> None:
+    async def give_up() -> Outcome:
+        with write_lock(square.path):
+            first = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
+            given_up = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
+            last = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("S", "N")))
+            await until(lambda: square.deconfliction.waiting == 2)
+            given_up.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await given_up
+        await first
+        return await asyncio.wait_for(last, timeout=2)
+
+    assert asyncio.run(give_up()).intent.state is State.ACCEPTED
+    assert square.deconfliction.is_running
+    assert_sound(square)
+
+
+def test_a_request_to_a_writer_that_has_stopped_is_refused_at_once(square: Process) -> None:
+    square.deconfliction.stop()
+
+    async def submit() -> None:
+        await asyncio.wait_for(square.deconfliction.submit(SQUARE.submission("N", "S")), timeout=2)
+
+    with pytest.raises(LedgerUnavailable):
+        asyncio.run(submit())
+
+
+def test_stopping_finishes_what_waits(square: Process) -> None:
+    async def stop_meanwhile() -> list[Outcome]:
+        with write_lock(square.path):
+            tasks = [asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S"))) for _ in range(3)]
+            await until(lambda: square.deconfliction.waiting == 2)
+            stopping = asyncio.create_task(asyncio.to_thread(square.deconfliction.stop))
+            await until(lambda: square.deconfliction.waiting == 3)
+        await stopping
+        return await asyncio.gather(*tasks)
+
+    assert [outcome.intent.sequence for outcome in asyncio.run(stop_meanwhile())] == [1, 2, 3]
+
+
+def test_a_full_queue_takes_nothing(ledger_path: Path, clock: FakeClock) -> None:
+    policy = Policy(POLICY.horizon_ms, POLICY.idempotency_ms, queue_limit=1)
+    with Process(ledger_path, SQUARE.airspace, clock, policy=policy) as process:
+
+        async def overfill() -> list[Outcome]:
+            with write_lock(process.path):
+                first = asyncio.create_task(process.deconfliction.submit(SQUARE.submission("N", "S")))
+                await asyncio.sleep(0)
+                await until(lambda: process.deconfliction.waiting == 0)
+                second = asyncio.create_task(process.deconfliction.submit(SQUARE.submission("N", "S")))
+                await asyncio.sleep(0)
+                with pytest.raises(QueueFull, match="1 requests are waiting"):
+                    await process.deconfliction.submit(SQUARE.submission("N", "S"))
+            return [await first, await second]
+
+        assert [outcome.intent.sequence for outcome in asyncio.run(overfill())] == [1, 2]
+        assert process.ledger.count() == 2
+
+
+# Cancellation (domain 4)
+
+
+def test_cancelling_before_departure_frees_the_space_at_once(street: Process) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    assert street.submit(STREET.submission("W", "E", window_ms=0)).state is State.REJECTED
+    cancelled = street.cancel(first)
+    again = street.submit(STREET.submission("W", "E", window_ms=0))
+    assert (cancelled.state, held(cancelled)) == (State.CANCELLED, set())
+    assert held(again) == held(first)
+    assert_sound(street)
+
+
+def test_cancelling_at_the_moment_of_departure_keeps_the_reservations_until_arrival(
+    street: Process, clock: FakeClock
+) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    clock.now_ms = departure(first)
+    cancelled = street.cancel(first)
+    assert (cancelled.state, held(cancelled)) == (State.CANCELLED, held(first))
+    behind = street.submit(STREET.submission("W", "E", earliest_ms=clock.now_ms))
+    assert departure(behind) > departure(first)
+    assert_sound(street, clock.now_ms)
+
+
+def test_a_millisecond_before_departure_the_reservations_still_go(street: Process, clock: FakeClock) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    clock.now_ms = DEPARTURE_MS - 1
+    assert held(street.cancel(first)) == set()
+
+
+def test_cancelling_at_the_moment_of_arrival_is_allowed(street: Process, clock: FakeClock) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    clock.now_ms = arrival(first)
+    assert street.cancel(first).state is State.CANCELLED
+
+
+def test_cancelling_after_arrival_is_an_illegal_transition(street: Process, clock: FakeClock) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    clock.now_ms = arrival(first) + 1
+    with pytest.raises(IllegalTransition, match=r"arrived at 2026-11-22T08:01:11\.676Z"):
+        street.cancel(first)
+    found = street.ledger.find(first.id)
+    assert found is not None
+    assert (found.state, found.version) == (State.ACCEPTED, 1)
+
+
+def test_cancelling_twice_changes_nothing_the_second_time(square: Process) -> None:
+    intent = square.submit(SQUARE.submission("N", "S"))
+    first = square.cancel(intent)
+    second = square.cancel(intent)
+    assert (second.state, second.version) == (State.CANCELLED, first.version)
+    assert_gapless(square.path)
+
+
+def test_a_refused_intent_cannot_be_cancelled(street: Process) -> None:
+    street.submit(STREET.submission("W", "E"))
+    refused = street.submit(STREET.submission("W", "E", window_ms=0))
+    with pytest.raises(IllegalTransition, match="is rejected and cannot be cancelled"):
+        street.cancel(refused)
+
+
+def test_an_intent_that_does_not_exist_cannot_be_cancelled(square: Process) -> None:
+    with pytest.raises(UnknownFlightIntent):
+        asyncio.run(square.deconfliction.cancel("no such id"))
+
+
+def test_what_a_flight_in_the_air_held_before_its_cancellation_is_in_the_journal_as_kept(
+    street: Process, clock: FakeClock
+) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    second = street.submit(STREET.submission("W", "E", earliest_ms=START_MS + 600_000))
+    clock.now_ms = departure(first)
+    street.cancel(first)
+    street.cancel(second)
+    entries = street.ledger.journal_after(2, 10)
+    assert [entry.kind for entry in entries] == ["cancelled", "cancelled"]
+    assert entries[0].released.tolist() == []
+    assert {tuple(hold) for hold in entries[1].released.tolist()} == held(second)
+
+
+# Idempotency keys
+
+
+def test_a_key_brings_the_first_answer_again_and_records_nothing(square: Process) -> None:
+    first, again = submit(square), submit(square)
+    assert (first.replayed, again.replayed, again.intent.id) == (None, b"1", first.intent.id)
+    assert square.ledger.count() == 1
+
+
+def test_a_key_with_another_body_is_refused(square: Process) -> None:
+    submit(square)
+    with pytest.raises(IdempotencyKeyReused):
+        submit(square, digest="another body")
+    assert square.ledger.count() == 1
+
+
+def test_two_operators_may_use_the_same_key(square: Process) -> None:
+    first, second = submit(square), submit(square, operator="other-air")
+    assert (first.intent.sequence, second.intent.sequence, second.replayed) == (1, 2, None)
+
+
+def test_a_key_is_kept_for_exactly_its_time(square: Process, clock: FakeClock) -> None:
+    submit(square, window_ms=THREE_DAYS_MS)
+    clock.advance(ms=POLICY.idempotency_ms)
+    assert submit(square, window_ms=THREE_DAYS_MS).replayed == b"1"
+    clock.advance(ms=1)
+    assert submit(square, window_ms=THREE_DAYS_MS).intent.sequence == 2
+
+
+def test_a_key_of_a_request_that_was_not_recorded_can_be_used_again(square: Process, clock: FakeClock) -> None:
+    clock.advance(seconds=361)
+    with pytest.raises(DepartureInThePast):
+        submit(square)
+    assert submit(square, earliest_ms=clock.now_ms, digest="another body").replayed is None
+
+
+def test_a_repetition_after_the_departure_has_passed_still_brings_the_first_answer(
+    square: Process, clock: FakeClock
+) -> None:
+    submit(square)
+    clock.advance(seconds=3600)
+    assert submit(square).replayed == b"1"
+
+
+def test_duplicates_in_one_batch_make_one_intent(square: Process) -> None:
+    request = SQUARE.submission("N", "S")
+    answers = square.together(*(square.deconfliction.submit(request, key("key")) for _ in range(4)))
+    assert [answer.replayed for answer in answers] == [None, b"1", b"1", b"1"]
+    assert square.ledger.count() == 1
+
+
+def test_a_key_outlives_the_process(ledger_path: Path, clock: FakeClock) -> None:
+    with Process(ledger_path, SQUARE.airspace, clock) as process:
+        submit(process)
+    with Process(ledger_path, SQUARE.airspace, clock) as process:
+        assert submit(process).replayed == b"1"
