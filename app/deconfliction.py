@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -24,6 +25,7 @@ from app.errors import (
     IllegalTransition,
     LedgerUnavailable,
     QueueFull,
+    RequestError,
     UnknownFlightIntent,
 )
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission, Trajectory
@@ -39,6 +41,8 @@ BATCH_REQUESTS = 64
 BATCH_PLANNING_S = 0.020
 # The index forgets the past in steps of this length; forgetting looks at every block once.
 _FORGET_EVERY_MS = 10_000
+# A departure window may have opened before the intent came, but not longer ago than this.
+_OPEN_FOR_MS = 86_400_000
 # A process that lags further behind than this many journal entries loads the ledger afresh.
 _CATCH_UP_ENTRIES = 1_000
 
@@ -111,6 +115,8 @@ class Deconfliction:
         self._watermark_ms = 0
         self._forgotten_ms = 0
         self._stopping = False
+        self._open = threading.Lock()
+        self._closed = False
 
     def start(self) -> None:
         """Load the index and begin to take requests; raises `LedgerUnavailable`."""
@@ -128,7 +134,7 @@ class Deconfliction:
     @property
     def is_running(self) -> bool:
         """Whether the writer can take requests."""
-        return self._thread.is_alive()
+        return self._thread.is_alive() and not self._closed
 
     @property
     def waiting(self) -> int:
@@ -187,13 +193,14 @@ class Deconfliction:
         return await self._enqueue(lambda tx, now: self._cancel(tx, now, intent_id), look_up)
 
     async def _enqueue(self, run: Callable[[Transaction, int], Answer], look_up: Callable[[], Answer | None]) -> Answer:
-        if not self.is_running:
-            raise LedgerUnavailable("the ledger writer has stopped")
         future: Future[Answer] = Future()
-        try:
-            self._queue.put_nowait(_Job(run, look_up, future))  # type: ignore[arg-type]
-        except queue.Full:
-            raise QueueFull(f"{self._policy.queue_limit} requests are waiting; try again in a second") from None
+        with self._open:
+            if not self.is_running:
+                raise LedgerUnavailable("the ledger writer has stopped")
+            try:
+                self._queue.put_nowait(_Job(run, look_up, future))  # type: ignore[arg-type]
+            except queue.Full:
+                raise QueueFull(f"{self._policy.queue_limit} requests are waiting; try again in a second") from None
         return await asyncio.wrap_future(future)
 
     def _now(self) -> int:
@@ -204,6 +211,9 @@ class Deconfliction:
         try:
             self._serve()
         finally:
+            # Whoever still got into the queue hears of it; nobody gets in any more.
+            with self._open:
+                self._closed = True
             while not self._queue.empty():
                 job = self._queue.get_nowait()
                 if job is not None and job.future.set_running_or_notify_cancel():
@@ -214,14 +224,15 @@ class Deconfliction:
             if not first.future.set_running_or_notify_cancel():
                 continue
             taken = [first]
+            failure: Exception | None = None
             answers: list[object]
             try:
                 answers = self._write(taken)
             except CommitUncertain as error:
-                log.error("commit uncertain, looking requests up", error=str(error), requests=len(taken))
+                failure = error
                 answers = [self._look_up(job) for job in taken]
             except Exception as error:
-                log.exception("batch failed, nothing recorded", requests=len(taken))
+                failure = error
                 known = isinstance(error, LedgerUnavailable)
                 answers = [error if known else LedgerUnavailable("the ledger writer failed")] * len(taken)
             for job, answer in zip(taken, answers, strict=True):
@@ -229,6 +240,9 @@ class Deconfliction:
                     job.future.set_exception(answer)
                 else:
                     job.future.set_result(answer)
+            # A log that cannot be written (its disk is full, its reader gone) must not stop the writer.
+            with suppress(OSError, ValueError):
+                _log_batch(answers, failure)
 
     def _write(self, taken: list[_Job]) -> list[object]:
         """Run the request in `taken` and those that wait behind it in one transaction; return their answers."""
@@ -267,19 +281,25 @@ class Deconfliction:
                 return job.run(transaction, now)
         except LedgerUnavailable:
             raise
+        except RequestError as error:
+            return error
         except ReservationOverlap as error:
-            log.error("the index missed a reservation, loading it afresh", error=str(error))
             self._catch_up(transaction, now, revision=None)
-            return LedgerUnavailable("the ledger refused the reservations; nothing was recorded, try again")
+            return LedgerUnavailable(f"the ledger refused the reservations, nothing was recorded; try again ({error})")
         except Exception as error:
+            # Wherever it happened, the index may be ahead of what the savepoint left.
+            self._catch_up(transaction, now, revision=None)
             return error
 
     def _look_up(self, job: _Job) -> object:
         """Return the answer to a request whose commit is uncertain: what the ledger has of it."""
         try:
             return job.look_up() or LedgerUnavailable("the commit failed; nothing was recorded")
-        except LedgerUnavailable as error:
-            return error
+        except Exception:
+            return LedgerUnavailable(
+                "the commit failed and the ledger cannot be read: it is not known whether this was recorded; "
+                "read the flight intents, or repeat the request with the same Idempotency-Key"
+            )
 
     def _catch_up(self, transaction: Transaction, now: int, revision: int | None) -> None:
         """Bring the index from a revision (None: from nothing) to the transaction's; drop what has passed."""
@@ -289,7 +309,8 @@ class Deconfliction:
             held = transaction.held_after(now)
             index.reserve(held.block, held.enter_ms, held.exit_ms, held.sequence)
             self._forgotten_ms = now
-            log.info("index loaded", revision=transaction.revision, reservations=len(held.block))
+            with suppress(OSError, ValueError):
+                log.info("index loaded", revision=transaction.revision, reservations=len(held.block))
         elif transaction.revision > revision:
             entries = transaction.journal_after(revision)
             for entry in entries:
@@ -306,6 +327,11 @@ class Deconfliction:
         if submission.latest_departure_ms < now:
             raise DepartureInThePast(
                 f"the latest departure, {format_time(submission.latest_departure_ms)}, has passed; "
+                f"it is {format_time(now)}"
+            )
+        if submission.earliest_departure_ms < now - _OPEN_FOR_MS:
+            raise DepartureInThePast(
+                f"the earliest departure, {format_time(submission.earliest_departure_ms)}, is more than a day ago; "
                 f"it is {format_time(now)}"
             )
         horizon = now + self._policy.horizon_ms
@@ -332,7 +358,6 @@ class Deconfliction:
                 )
             if first is not None:
                 return Outcome(first.intent, replayed=first.answer)
-        began = time.perf_counter()
         refusal = plan = None
         try:
             plan = self._plan(submission, now)
@@ -351,14 +376,6 @@ class Deconfliction:
             transaction.remember_answer(submission.operator, key.key, key.body_digest, intent, answer, now)
         held = intent.reservations
         self._planner.index.reserve(held.block, held.enter_ms, held.exit_ms, intent.sequence)
-        log.info(
-            f"flight intent {intent.state}",
-            flight_intent=intent.id,
-            sequence=intent.sequence,
-            operator=submission.operator,
-            reason=None if refusal is None else refusal.reason,
-            ms=round((time.perf_counter() - began) * 1000, 3),
-        )
         return Outcome(intent)
 
     def _cancel(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
@@ -379,8 +396,33 @@ class Deconfliction:
         if not in_flight:
             held = intent.reservations
             self._planner.index.release(held.block, held.enter_ms, held.exit_ms)
-        log.info("flight intent cancelled", flight_intent=intent.id, sequence=intent.sequence, in_flight=in_flight)
         return cancelled
+
+
+def _log_batch(answers: list[object], failure: Exception | None) -> None:
+    """Log what became of a batch, after it was answered: each intent that was recorded or changed, and what failed."""
+    if isinstance(failure, CommitUncertain):
+        log.error("commit uncertain, requests were looked up", error=str(failure), requests=len(answers))
+    elif failure is not None:
+        log.error("batch failed, nothing recorded", requests=len(answers), exc_info=failure)
+    for answer in answers:
+        if isinstance(answer, Outcome) and answer.replayed is None:
+            _log_intent(answer.intent)
+        elif isinstance(answer, FlightIntent):
+            _log_intent(answer)
+        elif failure is None and isinstance(answer, LedgerUnavailable):
+            log.error("index was wrong, loaded afresh", error=str(answer))
+
+
+def _log_intent(intent: FlightIntent) -> None:
+    reason = {} if intent.refusal is None else {"reason": intent.refusal.reason}
+    log.info(
+        f"flight intent {intent.state}",
+        flight_intent=intent.id,
+        sequence=intent.sequence,
+        operator=intent.submission.operator,
+        **reason,
+    )
 
 
 def _reservations(plan: Plan) -> Reservations:

@@ -44,8 +44,11 @@ def create_app(settings: Settings, clock: Callable[[], int] = now_ms, *, running
             yield {"service": running}
             return
         starting = service.running(settings, clock)
-        yield {"service": await to_thread.run_sync(starting.__enter__)}
-        await to_thread.run_sync(starting.__exit__, None, None, None)
+        started = await to_thread.run_sync(starting.__enter__)
+        try:
+            yield {"service": started}
+        finally:
+            await to_thread.run_sync(starting.__exit__, None, None, None)
 
     # Its documentation page needs no other server than this one.
     app = FastAPIOffline(

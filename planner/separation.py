@@ -34,6 +34,9 @@ __all__ = ["Approach", "CheckedFlight", "Clearance", "Kind", "Report", "Violatio
 # Flights whose trajectories are compared with their reservations at once: bounds memory.
 _CHUNK = 500
 
+# More violations of the premises than this, and distances are not looked at.
+_HOPELESS = 10_000
+
 _LATEST = np.iinfo(np.int64).max
 
 
@@ -45,7 +48,8 @@ class Report:
     `closest` is the smallest horizontal distance of two flights less than a block height apart vertically,
     `closest_vertical` the smallest vertical one of two less than a block side apart horizontally,
     `clearance` the smallest distance from a building: None where there is none. `near_misses` are what the
-    containment rule would forbid, under the midpoint rule.
+    containment rule would forbid, under the midpoint rule. Distances are not judged (`motion_judged`) where the
+    reservations are wrong by the ten thousands.
     """
 
     rule: OccupancyRule
@@ -61,6 +65,7 @@ class Report:
     clearance: Clearance | None
     violations: tuple[Violation, ...]
     near_misses: tuple[Violation, ...]
+    motion_judged: bool
 
     @property
     def ok(self) -> bool:
@@ -86,7 +91,9 @@ def verify(
         progress("reservations", begin / len(flights))
         violations += not_held(airspace, Traffic.of(flights[begin : begin + _CHUNK]))
     progress("reservations", 1.0)
-    legs = _legs(airspace.grid, traffic)
+    # Where the premises fail wholesale, so does the conclusion, for too many pairs of flights to list.
+    hopeless = len(violations) > _HOPELESS
+    legs = _legs(airspace.grid, Traffic.of([]) if hopeless else traffic)
     approaches = closest_approaches(airspace.grid, legs, lambda done: progress("closest approach", done))
     clearances = building_clearances(airspace, legs, lambda done: progress("buildings", done))
     near = [
@@ -108,6 +115,7 @@ def verify(
         clearance=clearances.smallest,
         violations=tuple(violations + near if promised else violations),
         near_misses=() if promised else tuple(near),
+        motion_judged=not hopeless,
     )
 
 

@@ -1,5 +1,6 @@
 """`airmatrix verify`: the independent checker over a whole ledger."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +10,7 @@ from rich.table import Table
 
 from app.commands.terminal import progress_bar, remark, show
 from app.flight_intents import FlightIntent, Reservations, State, Trajectory
-from app.ledger import Ledger, open_ledger
+from app.ledger import open_ledger
 from app.service import load_airspace
 from app.settings import Settings
 from app.times import format_time
@@ -28,47 +29,26 @@ def verify(
     """Check every reservation and trajectory of a ledger with none of the planner's code; exit 1 on a violation."""
     settings = Settings.given(ledger=ledger, airspace=airspace)
     field = load_airspace(settings)
-    book = open_ledger(settings.ledger, field)
-    try:
-        flights, states = _flights(book)
-    finally:
-        book.close()
+    with closing(open_ledger(settings.ledger, field)) as book:
+        intents, unknown = book.everything()
+    flights = [checked(intent) for intent in intents if intent.trajectory is not None or len(intent.reservations)]
+    flights += [_flight(f"unknown intent {sequence}", held, None) for sequence, held in unknown.items()]
     with progress_bar("checking", 1.0) as advance_to:
         report = judge(field, flights, lambda _, fraction: advance_to(fraction))
+    states = {state: sum(intent.state is state for intent in intents) for state in State}
     strays = [flight.id for flight in flights if len(flight.block) == 0 < len(flight.hold_block)]
     _print(report, states, strays, f"{settings.ledger}: {field.name}", field.grid)
     if strays or not report.ok:
         raise typer.Exit(1)
 
 
-def _flights(book: Ledger) -> tuple[list[CheckedFlight], dict[State, int]]:
-    """Return all that holds or should hold reservations, as the checker sees it, and the number of intents by state.
-
-    Reservations are read for themselves, not by way of the intents that should own them: those of a rejected or an
-    absent intent are judged too, as a flight without a trajectory.
-    """
-    held = book.held_by_intent()
-    flights = []
-    states = dict.fromkeys(State, 0)
-    with progress_bar("reading", book.count()) as advance_to:
-        for number, intent in enumerate(book.all_intents(), start=1):
-            states[intent.state] += 1
-            owned = held.pop(intent.sequence, Reservations.none())
-            if intent.trajectory is not None or len(owned):
-                flights.append(_checked(intent.id, owned, _trajectory(intent)))
-            advance_to(number)
-    flights += [_checked(f"unknown intent {sequence}", orphans, None) for sequence, orphans in held.items()]
-    return flights, states
+def checked(intent: FlightIntent) -> CheckedFlight:
+    """Return an intent as the checker sees it: with what it must hold, which is nothing if it was released wholly."""
+    released = intent.state is State.CANCELLED and len(intent.reservations) == 0
+    return _flight(intent.id, intent.reservations, None if released else intent.trajectory)
 
 
-def _trajectory(intent: FlightIntent) -> Trajectory | None:
-    """Return what the intent must hold: nothing if it was refused, or cancelled before it departed."""
-    if intent.state is State.CANCELLED and len(intent.reservations) == 0:
-        return None
-    return intent.trajectory
-
-
-def _checked(name: str, held: Reservations, trajectory: Trajectory | None) -> CheckedFlight:
+def _flight(name: str, held: Reservations, trajectory: Trajectory | None) -> CheckedFlight:
     none = np.empty(0, dtype=np.int64)
     return CheckedFlight(
         name,
@@ -93,6 +73,8 @@ def _print(report: Report, states: dict[State, int], strays: list[str], title: s
     table.add_row(
         "closest approach",
         f"no two flights within {grid.block_height_m:g} m vertically"
+        if closest is None and report.motion_judged
+        else "not judged, reservations are wrong wholesale"
         if closest is None
         else f"{closest.horizontal_m:.3f} m horizontally, {closest.vertical_m:.3f} m vertically, "
         f"at {format_time(closest.time_ms)}{promise}",

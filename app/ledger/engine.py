@@ -129,7 +129,7 @@ def _mark(path: Path) -> None:
 
 
 def _check_is_ledger(path: Path) -> bytes:
-    """Return the file's header. Nothing else is looked at: SQLite itself may write beside a database that it merely opens."""
+    """Return the file's header, read without SQLite, which may write beside a database that it merely opens."""
     try:
         with path.open("rb") as file:
             header = file.read(100)

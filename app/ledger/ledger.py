@@ -5,7 +5,7 @@ sees everything committed before it, so `sequence` and `revision` are gapless an
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -19,6 +19,9 @@ from app.ledger.rows import HeldReservations, by_intent, columns_of, dump_column
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
+
+# Databases bound how many values a statement may name.
+_BOUND_AT_ONCE = 10_000
 
 
 class ReservationOverlap(Exception):
@@ -81,7 +84,9 @@ class Ledger:
         try:
             try:
                 connection.begin()
-                yield Transaction(connection, self._airspace)
+                transaction = Transaction(connection, self._airspace)
+                yield transaction
+                transaction.write_counters()
             except DBAPIError as error:
                 connection.invalidate()
                 raise LedgerUnavailable(f"the ledger cannot be written: {error.orig}") from error
@@ -148,18 +153,17 @@ class Ledger:
             held = _reservations(connection, self._airspace, [row.sequence for row in rows])
         return [to_intent(row, self._airspace, held[row.sequence]) for row in rows]
 
-    def all_intents(self, batch: int = 500) -> Iterator[FlightIntent]:
-        """Yield every intent by sequence."""
-        sequence = 0
-        while intents := self.page(after_sequence=sequence, limit=batch):
-            yield from intents
-            sequence = intents[-1].sequence
+    def everything(self) -> tuple[list[FlightIntent], dict[int, Reservations]]:
+        """Return all intents by sequence, and reservations that name an intent which does not exist, as of one moment.
 
-    def held_by_intent(self) -> dict[int, Reservations]:
-        """Return all reservations by the sequence number they name, whether or not there is such an intent."""
+        Reservations are read for themselves, not by way of the intents that should own them.
+        """
         with self._reading() as connection:
-            held = to_held(connection.execute(select(reservations)).all())
-        return by_intent(held, np.unique(held.sequence).tolist(), self._airspace.grid)
+            held = to_held(connection.execute(select(reservations)))
+            rows = connection.execute(select(flight_intents).order_by(flight_intents.c.sequence)).all()
+        owned = by_intent(held, np.unique(held.sequence).tolist(), self._airspace.grid)
+        intents = [to_intent(row, self._airspace, owned.pop(row.sequence, Reservations.none())) for row in rows]
+        return intents, owned
 
     def count(self) -> int:
         """Return how many intents are recorded."""
@@ -174,8 +178,7 @@ class Ledger:
         else:
             query = query.where(reservations.c.block == block)
         with self._reading() as connection:
-            rows = connection.execute(query.order_by(reservations.c.block, reservations.c.enter)).all()
-        return to_held(rows)
+            return to_held(connection.execute(query.order_by(reservations.c.block, reservations.c.enter)))
 
     def use_between(self, from_ms: int, to_ms: int) -> tuple[IntArray, IntArray]:
         """Return the blocks reserved within [from, to), and for how many ms of it: two arrays (n,)."""
@@ -192,7 +195,7 @@ class Ledger:
             rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 2)
         return rows[:, 0], rows[:, 1]
 
-    def ids(self, sequences: Sequence[int]) -> dict[int, str]:
+    def ids(self, sequences: Iterable[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
         with self._reading() as connection:
             return _ids(connection, sequences)
@@ -287,7 +290,7 @@ class Transaction:
         """Return an intent with its reservations, None if there is none."""
         return _find(self._connection, self._airspace, intent_id)
 
-    def ids(self, sequences: Sequence[int]) -> dict[int, str]:
+    def ids(self, sequences: Iterable[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
         return _ids(self._connection, sequences)
 
@@ -300,7 +303,7 @@ class Transaction:
         query = select(reservations).where(reservations.c.exit > time_ms)
         if sequences is not None:
             query = query.where(reservations.c.intent.in_(sequences))
-        return to_held(self._connection.execute(query.order_by(reservations.c.intent)).all())
+        return to_held(self._connection.execute(query.order_by(reservations.c.intent)))
 
     def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
         """Return the first answer to an idempotency key, None if it is new."""
@@ -321,14 +324,17 @@ class Transaction:
         """Drop idempotency keys first used before a time."""
         self._connection.execute(delete(idempotency_keys).where(idempotency_keys.c.created < before_ms))
 
-    def _advance(self, *, sequence: bool) -> None:
-        self._sequence += sequence
-        self.revision += 1
+    def write_counters(self) -> None:
+        """Write down how far the counters have come: once, before the commit."""
         self._connection.execute(
             update(counters).values(
                 sequence=self._sequence, revision=self.revision, longest_flight=self._longest_flight_ms
             )
         )
+
+    def _advance(self, *, sequence: bool) -> None:
+        self._sequence += sequence
+        self.revision += 1
 
     def _append(self, intent: FlightIntent, now_ms: int, kind: str, released: Reservations | None) -> None:
         self._connection.execute(
@@ -375,7 +381,7 @@ def _answer_to(connection: Connection, airspace: Airspace, operator: str, key: s
 def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:
     """Return the reservations of some intents."""
     query = select(reservations).where(reservations.c.intent.in_(sequences))
-    return by_intent(to_held(connection.execute(query).all()), sequences, airspace.grid)
+    return by_intent(to_held(connection.execute(query)), sequences, airspace.grid)
 
 
 def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:
@@ -388,9 +394,14 @@ def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:
     )
 
 
-def _ids(connection: Connection, sequences: Sequence[int]) -> dict[int, str]:
-    query = select(flight_intents.c.sequence, flight_intents.c.id).where(flight_intents.c.sequence.in_(sequences))
-    return {row.sequence: row.id for row in connection.execute(query)}
+def _ids(connection: Connection, sequences: Iterable[int]) -> dict[int, str]:
+    ids = {}
+    unique = sorted(set(sequences))
+    for start in range(0, len(unique), _BOUND_AT_ONCE):
+        part = flight_intents.c.sequence.in_(unique[start : start + _BOUND_AT_ONCE])
+        rows = connection.execute(select(flight_intents.c.sequence, flight_intents.c.id).where(part))
+        ids.update({row.sequence: row.id for row in rows})
+    return ids
 
 
 def _journal_after(connection: Connection, revision: int, limit: int | None) -> list[JournalEntry]:

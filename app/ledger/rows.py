@@ -3,16 +3,19 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import orjson
-from sqlalchemy import Row
+from sqlalchemy import Result, Row
 
 from app.errors import LedgerDamaged
 from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
 from planner.airmatrix import AirMatrix, IntArray
 from planner.airspace import Airspace
+
+_ROWS_AT_ONCE = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +96,13 @@ def _parsed(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightInte
     )
 
 
-def to_held(rows: Sequence[Row[Any]]) -> HeldReservations:
-    """Return rows of `reservations` as columns."""
-    columns = np.array([tuple(row) for row in rows], dtype=np.int64).reshape(-1, 4)
+def to_held(result: Result[Any]) -> HeldReservations:
+    """Return rows of `reservations` as columns, read in parts: there may be millions."""
+    parts = [
+        np.fromiter(chain.from_iterable(part), dtype=np.int64, count=4 * len(part)).reshape(-1, 4)
+        for part in result.partitions(_ROWS_AT_ONCE)
+    ]
+    columns = np.concatenate([np.empty((0, 4), dtype=np.int64), *parts])
     return HeldReservations(columns[:, 0], columns[:, 1], columns[:, 2], columns[:, 3])
 
 

@@ -1,5 +1,6 @@
 """The airspace: what it is, what buildings take of it, who uses it when."""
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -72,6 +73,9 @@ class FeatureCollection(BaseModel):
 
     type: Literal["FeatureCollection"]
     features: list[dict[str, Any]]
+
+
+_FEATURES = FeatureCollection.model_json_schema()
 
 
 class StaticAnswer(BaseModel):
@@ -177,7 +181,7 @@ def read(service: ServiceDep) -> AirspaceAnswer:
 @router.get(
     "/buildings",
     response_class=Response,
-    responses={200: {"model": FeatureCollection}, **problems.documented()},
+    responses={200: {"content": {GEOJSON: {"schema": _FEATURES}}}, **problems.documented()},
     summary="Read the buildings",
 )
 def read_buildings(service: ServiceDep) -> Response:
@@ -205,7 +209,10 @@ def list_static(service: ServiceDep, layer: Layer = None) -> Response:
 @router.get(
     "/status",
     response_class=Response,
-    responses={200: {"model": StatusAnswer, "content": {GEOJSON: {}}}, **problems.documented(422, 503)},
+    responses={
+        200: {"model": StatusAnswer, "content": {GEOJSON: {"schema": _FEATURES}}},
+        **problems.documented(422, 503),
+    },
     summary="Status of the blocks in use",
 )
 def read_status(
@@ -350,8 +357,8 @@ def _within(grid: AirMatrix, blocks: Any, bbox: str | None) -> Any:
         west, south, east, north = (float(part) for part in bbox.split(","))
     except ValueError:
         raise _invalid("bbox", "expected west,south,east,north in degrees") from None
-    if not (west <= east and south <= north):
-        raise _invalid("bbox", "west must not exceed east, nor south north")
+    if not (-math.inf < west <= east < math.inf and -math.inf < south <= north < math.inf):
+        raise _invalid("bbox", "west must not exceed east, nor south north, and all must be finite")
     lon, lat = grid.corners
     i, j, _ = grid.ijk(blocks).T
     corners = ((j, i), (j, i + 1), (j + 1, i), (j + 1, i + 1))

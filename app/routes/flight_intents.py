@@ -20,7 +20,9 @@ from planner.errors import DestinationBlocked, NoPlan, OriginBlocked
 
 router = APIRouter(prefix="/v1/flight-intents", tags=["flight intents"])
 
-Label = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Label = Annotated[
+    str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")
+]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 BlockIndices = tuple[int, int, int]
 

@@ -8,7 +8,8 @@ from planner.airmatrix import IntArray
 from planner.kernels.labels import BLOCK, GAP_START
 from planner.kernels.policy import kernel
 
-H_BITS = 30
+# 6 days of H, 99 of F.
+H_BITS = 29
 MAX_H = (1 << H_BITS) - 1
 MAX_F = (1 << (62 - H_BITS)) - 1
 

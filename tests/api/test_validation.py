@@ -12,7 +12,7 @@ from app.main import create_app
 from app.settings import Settings
 from tests.api.bodies import PREVIEW, PROBLEM, SUBMIT, intent, problem
 from tests.api.serving import Client, served
-from tests.ledger.district import OLD_TOWN
+from tests.ledger.district import OLD_TOWN, START_MS
 from tests.ledger.process import FakeClock
 
 JSON = {"Content-Type": "application/json"}
@@ -297,6 +297,12 @@ def test_a_latest_departure_before_the_earliest_is_refused(client: Client) -> No
 
 def test_a_latest_departure_at_the_earliest_is_accepted(client: Client) -> None:
     assert client.post(PREVIEW, json=intent(window_ms=0)).status_code == 200
+
+
+@pytest.mark.parametrize(("before_ms", "status"), [(86_400_000, 200), (86_400_001, 422)])
+def test_a_window_may_have_opened_a_day_ago_at_most(client: Client, before_ms: int, status: int) -> None:
+    body = intent(earliest_ms=START_MS - before_ms, window_ms=before_ms + 60_000)
+    assert client.post(PREVIEW, json=body).status_code == status
 
 
 def test_an_earliest_departure_ages_ago_is_refused_as_absurd(client: Client) -> None:

@@ -92,7 +92,7 @@ class LedgerMachine(RuleBasedStateMachine):
     def the_ledger_holds_what_was_answered(self) -> None:
         table = reserved(self.process.path)
         assert {(*hold, intent) for hold, intent in table.items()} == self.kept
-        assert {intent.sequence: intent.state for intent in self.process.ledger.all_intents()} == self.states
+        assert {intent.sequence: intent.state for intent in self.process.ledger.everything()[0]} == self.states
 
     @invariant()
     def nothing_overlaps_and_nothing_is_missing(self) -> None:

@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Never
 
 import pytest
+import structlog
 from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import OperationalError
 
-from app.deconfliction import IdempotencyKey, Outcome, Policy
+from app.deconfliction import IdempotencyKey, Outcome, Policy, PreviewPlan
 from app.errors import (
     BeyondHorizon,
     DepartureInThePast,
@@ -185,6 +187,7 @@ def test_a_preview_is_the_plan_that_a_submission_gets_next(street: Process) -> N
     preview = asyncio.run(street.deconfliction.preview(STREET.submission("W", "E")))
     intent = street.submit(STREET.submission("W", "E"))
     assert intent.trajectory is not None
+    assert isinstance(preview, PreviewPlan)
     for column in ("block", "arrive_ms", "depart_ms"):
         assert getattr(preview.trajectory, column).tolist() == getattr(intent.trajectory, column).tolist()
     for column in ("block", "enter_ms", "exit_ms"):
@@ -283,6 +286,41 @@ def test_after_a_commit_that_failed_the_service_goes_on_as_if_it_had_not_been_tr
     second = square.submit(SQUARE.submission("S", "N"))
     assert [first.sequence, second.sequence] == [1, 2]
     assert_sound(square)
+
+
+@contextmanager
+def broken_log() -> Iterator[None]:
+    """Let every attempt to log fail, as it does when the log's disk is full."""
+
+    def fail_to_log(*_: object) -> Never:
+        raise OSError("no space left on device")
+
+    before = structlog.get_config()
+    structlog.configure(processors=[fail_to_log])
+    yield
+    structlog.configure(**before)
+
+
+def test_a_log_that_cannot_be_written_stops_nothing_and_reserves_nothing_twice(street: Process) -> None:
+    with broken_log():
+        first = street.submit(STREET.submission("W", "E"))
+        with on_commit(fail), pytest.raises(LedgerUnavailable):
+            street.submit(STREET.submission("W", "E"))
+        with on_commit(commit_and_fail):
+            second = street.submit(STREET.submission("W", "E"))
+    assert (first.sequence, second.sequence) == (1, 2)
+    assert_sound(street)
+
+
+def test_a_request_that_fails_as_nobody_expected_holds_nothing(street: Process) -> None:
+    def fail_to_render(_: Outcome) -> Never:
+        raise RuntimeError("a bug")
+
+    with pytest.raises(RuntimeError, match="a bug"):
+        street.submit(STREET.submission("W", "E"), IdempotencyKey("key", "digest", fail_to_render))
+    assert street.ledger.count() == 0
+    assert departure(street.submit(STREET.submission("W", "E"))) == DEPARTURE_MS
+    assert_sound(street)
 
 
 def test_requests_whose_commit_was_lost_after_it_happened_are_answered_from_the_ledger(street: Process) -> None:

@@ -285,6 +285,15 @@ def stops_of(one: CheckedFlight) -> list[Stop]:
 # Reservations
 
 
+def test_where_reservations_are_wrong_wholesale_distances_are_not_looked_at() -> None:
+    many = [((1, 1, 1), 0, 1000)] * 10_002
+    report = verify(AIRSPACE, [flight("one", holds=many)])
+
+    assert len(report.violations) == 10_001
+    assert not report.motion_judged
+    assert verify(AIRSPACE, [flight("one", holds=many[1:])]).motion_judged
+
+
 def test_reservations_of_a_block_that_touch_are_disjoint() -> None:
     report = verify(
         AIRSPACE,

@@ -76,7 +76,7 @@ def verified(ledger: Path, airspace: Airspace) -> Report:
     """Return what the checker says of a ledger's accepted flights."""
     opened = open_ledger(str(ledger), airspace)
     try:
-        return verify(airspace, [checked(found) for found in opened.all_intents() if found.state == "accepted"])
+        return verify(airspace, [checked(found) for found in opened.everything()[0] if found.state == "accepted"])
     finally:
         opened.close()
 
@@ -130,7 +130,7 @@ def test_a_busy_district_stays_separated_also_after_a_restart(city: Settings, cl
 def test_the_checker_would_have_seen_two_flights_on_one_path(city: Settings, clock: FakeClock) -> None:
     with served(create_app(city, clock)) as client:
         client.post(SUBMIT, json=intent((0, 0, 0), (14, 14, 0), district=CITY))
-        (flight,) = (checked(found) for found in client.service.ledger.all_intents())
+        (flight,) = (checked(found) for found in client.service.ledger.everything()[0])
     twin = CheckedFlight(
         "twin", flight.block, flight.arrive_ms, flight.depart_ms, flight.hold_block, flight.hold_enter_ms,
         flight.hold_exit_ms,

@@ -57,7 +57,7 @@ def test_eight_operators_racing_for_one_corridor_get_it_one_after_the_other(stre
     assert [answer["sequence"] for answer in planned] == list(range(1, CLIENTS * FLIGHTS + 1))
     # Each is planned after everything before it, so nobody who came later delayed it: the first departs at once.
     assert planned[0]["delay_s"] == 0.0
-    report = verify(STREET.airspace, [checked(found) for found in street.service.ledger.all_intents()])
+    report = verify(STREET.airspace, [checked(found) for found in street.service.ledger.everything()[0]])
     assert report.violations == ()
     assert_no_overlaps(tmp_path / "ledger.sqlite")
     assert_gapless(tmp_path / "ledger.sqlite")
