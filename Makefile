@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test lint lock openapi
+.PHONY: help install serve test bench lint lock openapi
 
 help:  ## Show these targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -23,6 +23,9 @@ serve: $(INSTALLED)  ## Run the service on http://127.0.0.1:8000
 
 test: $(INSTALLED)  ## Run the tests
 	$(BIN)/pytest
+
+bench: $(INSTALLED)  ## Time the planner on 300 to 3,000 flights
+	$(BIN)/python -m tests.benchmark.bench
 
 lint: $(INSTALLED)  ## Check style, types, layers and the container files
 	$(BIN)/ruff check

@@ -1,6 +1,7 @@
 """Opening a ledger: where it is, whether it is one, which schema it has, whose airspace it belongs to."""
 
 import sqlite3
+import time
 from contextlib import closing
 from importlib.resources import files
 from pathlib import Path
@@ -120,12 +121,18 @@ def _engine(path: Path, *, writes: bool) -> Engine:
 
 def _mark(path: Path) -> None:
     """Make an empty file a ledger; the mark comes first, so that one whose creation was cut short is still one."""
-    try:
-        with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S, isolation_level=None)) as connection:
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute("PRAGMA journal_mode = WAL")
-    except sqlite3.Error as error:
-        raise StartupError(f"cannot create ledger {path}: {error}") from error
+    give_up = time.monotonic() + _BUSY_TIMEOUT_S
+    while True:
+        try:
+            with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S, isolation_level=None)) as connection:
+                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+                connection.execute("PRAGMA journal_mode = WAL")
+                return
+        except sqlite3.Error as error:
+            # SQLite does not wait for others by itself when it changes the journal mode.
+            if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
+                raise StartupError(f"cannot create ledger {path}: {error}") from error
+        time.sleep(0.01)
 
 
 def _check_is_ledger(path: Path) -> bytes:
