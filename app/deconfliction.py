@@ -28,12 +28,12 @@ from app.errors import (
     RequestError,
     UnknownFlightIntent,
 )
-from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission, Trajectory
+from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
 from app.ledger.ledger import CommitUncertain, Ledger, ReservationOverlap, Transaction
 from app.times import format_time
 from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import NoPlan
-from planner.path import Plan
+from planner.path import Plan, Trajectory
 
 log = structlog.get_logger()
 
@@ -174,7 +174,7 @@ class Deconfliction:
                 plan = self._plan(submission, now)
             except NoPlan as error:
                 return _refusal(error, transaction)
-            return PreviewPlan(submission, Trajectory.of(plan), _reservations(plan))
+            return PreviewPlan(submission, plan, _reservations(plan))
 
         return await self._enqueue(run, lambda: None)
 
@@ -367,7 +367,7 @@ class Deconfliction:
             intent_id=intent_id,
             submission=submission,
             now_ms=now,
-            trajectory=None if plan is None else Trajectory.of(plan),
+            trajectory=plan,
             reservations=None if plan is None else _reservations(plan),
             refusal=refusal,
         )

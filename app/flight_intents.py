@@ -6,7 +6,7 @@ from enum import StrEnum
 import numpy as np
 
 from planner.airmatrix import IntArray
-from planner.path import Plan
+from planner.path import Trajectory
 
 
 class State(StrEnum):
@@ -41,37 +41,6 @@ class Submission:
     destination_block: int
     earliest_departure_ms: int
     latest_departure_ms: int
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """A planned path, as `planner.path.Plan`, without its holds."""
-
-    block: IntArray
-    arrive_ms: IntArray
-    depart_ms: IntArray
-    unconstrained_ms: int
-    terminal_dwell_ms: int
-
-    @classmethod
-    def of(cls, plan: Plan) -> "Trajectory":
-        """Keep what the ledger keeps of a plan."""
-        return cls(plan.block, plan.arrive_ms, plan.depart_ms, plan.unconstrained_ms, plan.terminal_dwell_ms)
-
-    @property
-    def departure_ms(self) -> int:
-        """Start of the first hold."""
-        return int(self.arrive_ms[0])
-
-    @property
-    def arrival_ms(self) -> int:
-        """End of the last hold, landing dwell included."""
-        return int(self.depart_ms[-1])
-
-    @property
-    def hover_ms(self) -> int:
-        """Waiting in flight, terminal dwell excluded."""
-        return int((self.depart_ms - self.arrive_ms).sum()) - 2 * self.terminal_dwell_ms
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,27 +6,18 @@ from planner.airmatrix import IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """A conflict-free path. All times int64 ms, all blocks flat indices.
+class Trajectory:
+    """A flight's path. Times are int64 ms, blocks flat indices.
 
-    `block`, `arrive_ms`, `depart_ms` (n,): the chain of block centres; the first arrival is the departure, the
-    last departure the arrival, terminal dwell included. `hold_*` (m,): half-open holds [enter, exit), overlapping
-    ones of a block merged, sorted by enter, then i, j, k. `slot_opens_ms` is the first moment,
-    from the earliest departure on, of the free interval in which the first block is left. `unconstrained_ms` is the
-    flight time without traffic.
+    `block`, `arrive_ms`, `depart_ms` (n,): the chain of block centres; the first arrival is the departure, the last
+    departure the arrival, terminal dwell included. `unconstrained_ms` is the flight time without traffic.
     """
 
     block: IntArray
     arrive_ms: IntArray
     depart_ms: IntArray
-    hold_block: IntArray
-    hold_enter_ms: IntArray
-    hold_exit_ms: IntArray
-    earliest_departure_ms: int
-    slot_opens_ms: int
     unconstrained_ms: int
     terminal_dwell_ms: int
-    expansions: int
 
     @property
     def departure_ms(self) -> int:
@@ -35,7 +26,7 @@ class Plan:
 
     @property
     def arrival_ms(self) -> int:
-        """End of the flight, landing dwell included."""
+        """End of the last hold, landing dwell included."""
         return int(self.depart_ms[-1])
 
     @property
@@ -44,14 +35,31 @@ class Plan:
         return self.arrival_ms - self.departure_ms
 
     @property
-    def ground_hold_ms(self) -> int:
-        """Wait before departure, which holds no block."""
-        return self.departure_ms - self.earliest_departure_ms
-
-    @property
     def hover_ms(self) -> int:
         """Wait at block centres in flight, terminal dwell excluded."""
         return int((self.depart_ms - self.arrive_ms).sum()) - 2 * self.terminal_dwell_ms
+
+
+@dataclass(frozen=True, eq=False)
+class Plan(Trajectory):
+    """A conflict-free path and what the search knows of it.
+
+    `hold_*` (m,): half-open holds [enter, exit), overlapping ones of a block merged, sorted by enter, then i, j, k.
+    `slot_opens_ms` is the first moment, from the earliest departure on, of the free interval of the first block in
+    which the flight departs.
+    """
+
+    hold_block: IntArray
+    hold_enter_ms: IntArray
+    hold_exit_ms: IntArray
+    earliest_departure_ms: int
+    slot_opens_ms: int
+    expansions: int
+
+    @property
+    def ground_hold_ms(self) -> int:
+        """Wait before departure, which holds no block."""
+        return self.departure_ms - self.earliest_departure_ms
 
     @property
     def delay_ms(self) -> int:

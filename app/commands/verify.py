@@ -9,13 +9,14 @@ import typer
 from rich.table import Table
 
 from app.commands.terminal import progress_bar, remark, show
-from app.flight_intents import FlightIntent, Reservations, State, Trajectory
+from app.flight_intents import FlightIntent, Reservations, State
 from app.ledger import open_ledger
 from app.service import load_airspace
 from app.settings import Settings
 from app.times import format_time
 from planner.airmatrix import AirMatrix
 from planner.airspace import OccupancyRule
+from planner.path import Trajectory
 from planner.separation import CheckedFlight, Report, Violation
 from planner.separation import verify as judge
 

@@ -14,11 +14,12 @@ from sqlalchemy import ColumnElement, Connection, Engine, and_, case, delete, fu
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.errors import LedgerUnavailable
-from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission, Trajectory
+from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
 from app.ledger.rows import HeldReservations, by_intent, columns_of, dump_columns, to_held, to_intent, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
+from planner.path import Trajectory
 
 # Databases bound how many values a statement may name.
 _BOUND_AT_ONCE = 10_000
@@ -252,7 +253,7 @@ class Transaction:
         """Insert an intent, accepted with its reservations or rejected, under the next sequence number."""
         state = State.REJECTED if trajectory is None else State.ACCEPTED
         if trajectory is not None:
-            flight_ms = trajectory.arrival_ms - trajectory.departure_ms
+            flight_ms = trajectory.flight_time_ms
             self._longest_flight_ms = max(self._longest_flight_ms, flight_ms)
         self._advance(sequence=True)
         intent = FlightIntent(

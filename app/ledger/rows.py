@@ -11,9 +11,10 @@ import orjson
 from sqlalchemy import Result, Row
 
 from app.errors import LedgerDamaged
-from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
+from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission
 from planner.airmatrix import AirMatrix, IntArray
 from planner.airspace import Airspace
+from planner.path import Trajectory
 
 _ROWS_AT_ONCE = 10_000
 

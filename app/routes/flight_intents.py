@@ -11,12 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from app import problems
 from app.deconfliction import IdempotencyKey, Outcome
 from app.errors import PriorityNotSupported, UnknownAircraftType, UnknownFlightIntent
-from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission, Trajectory
+from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission
 from app.routes import paging
 from app.service import Service, ServiceDep
 from app.times import Moment, Timestamp, format_time, format_times
 from planner.airmatrix import AirMatrix
 from planner.errors import DestinationBlocked, NoPlan, OriginBlocked
+from planner.path import Trajectory
 
 router = APIRouter(prefix="/v1/flight-intents", tags=["flight intents"])
 
@@ -314,7 +315,7 @@ def _planned(
         answer |= {
             "departure": format_time(departure_ms),
             "arrival": format_time(arrival_ms),
-            "flight_time_s": (arrival_ms - departure_ms) / 1000,
+            "flight_time_s": trajectory.flight_time_ms / 1000,
             "ground_hold_s": (departure_ms - submission.earliest_departure_ms) / 1000,
             "hover_s": trajectory.hover_ms / 1000,
             "delay_s": delay_ms / 1000,
