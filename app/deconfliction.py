@@ -32,7 +32,7 @@ from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submi
 from app.ledger.ledger import CommitUncertain, Ledger, ReservationOverlap, Transaction
 from app.times import format_time
 from planner.cfa_star import Performance, Planner, PlanRequest
-from planner.errors import NoPlan
+from planner.errors import NoPlan, PlannerError
 from planner.path import Plan, Trajectory
 
 log = structlog.get_logger()
@@ -281,7 +281,7 @@ class Deconfliction:
                 return job.run(transaction, now)
         except LedgerUnavailable:
             raise
-        except RequestError as error:
+        except (RequestError, PlannerError) as error:
             return error
         except ReservationOverlap as error:
             self._catch_up(transaction, now, revision=None)

@@ -166,11 +166,6 @@ class Ledger:
         intents = [to_intent(row, self._airspace, owned.pop(row.sequence, Reservations.none())) for row in rows]
         return intents, owned
 
-    def count(self) -> int:
-        """Return how many intents are recorded."""
-        with self._reading() as connection:
-            return int(connection.execute(select(func.count()).select_from(flight_intents)).scalar_one())
-
     def held_between(self, from_ms: int, to_ms: int, block: int | None = None) -> HeldReservations:
         """Return the reservations that overlap [from, to), by block and enter."""
         query = select(reservations).where(reservations.c.enter < to_ms, reservations.c.exit > from_ms)
@@ -216,6 +211,7 @@ class Transaction:
         self._sequence, self.revision, self._longest_flight_ms = connection.execute(
             select(counters.c.sequence, counters.c.revision, counters.c.longest_flight)
         ).one()
+        self._begun_at = self.revision
 
     @contextmanager
     def savepoint(self) -> Iterator[None]:
@@ -326,7 +322,9 @@ class Transaction:
         self._connection.execute(delete(idempotency_keys).where(idempotency_keys.c.created < before_ms))
 
     def write_counters(self) -> None:
-        """Write down how far the counters have come: once, before the commit."""
+        """Write down how far the counters have come: once, before the commit, and not where nothing has changed."""
+        if self.revision == self._begun_at:
+            return
         self._connection.execute(
             update(counters).values(
                 sequence=self._sequence, revision=self.revision, longest_flight=self._longest_flight_ms
