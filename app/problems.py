@@ -2,7 +2,7 @@
 
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import orjson
@@ -191,8 +191,12 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         if error.status_code == 400:
             return response(KINDS[errors.MalformedRequest], "the body cannot be parsed")
-        kind = HTTP_ERRORS[error.status_code]
-        return response(kind, kind.advice, headers=error.headers)
+        known = HTTP_ERRORS.get(error.status_code)
+        if known is not None:
+            return response(known, known.advice, headers=error.headers)
+        # What the framework refuses for reasons of its own is malformed to us, under the framework's status.
+        malformed = replace(KINDS[errors.MalformedRequest], status=error.status_code)
+        return response(malformed, str(error.detail), headers=error.headers)
 
     async def unexpected_error(request: Request, error: Exception) -> Response:
         error_id = str(uuid.uuid4())

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, HTTPException
 from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import OperationalError
 
@@ -346,6 +346,17 @@ def test_an_unexpected_error_is_logged_with_its_id(
         error_id = client.get("/bug").json()["error_id"]
     (line,) = [line for line in capsys.readouterr().out.splitlines() if error_id in line]
     assert "swordfish" in line
+
+
+def test_what_the_framework_alone_refuses_is_a_problem_with_its_status(settings: Settings, clock: FakeClock) -> None:
+    app = create_app(settings, clock)
+
+    @app.get("/teapot")
+    def teapot() -> None:
+        raise HTTPException(418, "short and stout")
+
+    with served(app) as client:
+        assert problem(client.get("/teapot"), 418, "malformed-request")["detail"] == "short and stout"
 
 
 # Documentation
