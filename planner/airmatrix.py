@@ -16,6 +16,7 @@ from pyproj.exceptions import CRSError
 from planner.errors import AirspaceFileError, Block, OutsideAirspace
 
 IntArray = npt.NDArray[np.int64]
+Int32Array = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
 # Counts are floors of a quotient of metres; this keeps 2000 / 20 from being 99.

@@ -22,16 +22,16 @@ from planner.kernels import path as path_kernels
 from planner.kernels import search as search_kernels
 from planner.kernels.connectivity import label_components
 from planner.kernels.endurance import within_endurance
-from planner.kernels.intervals import Slabs, empty_slabs
-from planner.kernels.labels import Task, new_workspace
+from planner.kernels.labels import LAST_STAMP, Task, larger_workspace, new_workspace
 from planner.kernels.motion import Motion
+from planner.kernels.static_search import Bounds, static_search
 from planner.links import LinkTimes, build_link_times, build_offsets
 from planner.occupancy import OccupancyIndex, build_motion, open_links
 from planner.path import Plan
 
 # How far beyond the requested window a refusal looks for a departure that would work; within what keys can order.
 _OUTLOOK_MS = 1 << 31
-_INITIAL_LABELS = 1 << 14
+_FEWEST_LABELS = 1 << 14
 # A refusal names the flights around as many labels at most: a flight that is shut in has few.
 _SHUT_IN_LABELS = 100
 
@@ -83,8 +83,8 @@ class Planner:
         self._open_links = open_links(airspace)
         self._offsets = build_offsets(airspace.grid)
         self._components = label_components(self._open_links, self._offsets)
-        self._empty = empty_slabs(airspace.grid.block_count, pool_size=1)
-        self._workspace = new_workspace(airspace.grid.block_count, _INITIAL_LABELS)
+        # Memory that no search touches costs nothing.
+        self._workspace = new_workspace(airspace.grid.block_count, max(_FEWEST_LABELS, airspace.grid.block_count // 8))
         self._stamp = 0
         self._motions: dict[tuple[int, ...], Motion] = {}
 
@@ -99,17 +99,19 @@ class Planner:
             The present reservations leave no plan.
         """
         self.check(request.origin, request.destination)
-        found = self._search(request)
+        motion = self._motion(request.performance)
+        bounds, expansions = self._bounds(motion, request.origin, request.destination)
+        found = self._search(request, motion, bounds, expansions)
         if isinstance(found, Plan):
             return found
-        found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request)
+        found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request, motion, bounds)
         raise found
 
     def unconstrained(self, request: PlanRequest) -> int:
         """Return the flight time without traffic in ms, dwell included: A* under the airspace's rule."""
         self.check(request.origin, request.destination)
-        task = Task(request.origin, request.destination, 0, 0, self.airspace.terminal_dwell_ms, 0, stamp=0)
-        return self._unconstrained(self._motion(request.performance), task)
+        bounds, _ = self._bounds(self._motion(request.performance), request.origin, request.destination)
+        return bounds.optimum + 2 * self.airspace.terminal_dwell_ms
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to these blocks, if any."""
@@ -122,9 +124,18 @@ class Planner:
         if self._components[origin] != self._components[destination]:
             raise Disconnected("buildings leave no way from the origin's block to the destination's")
 
-    def _search(self, request: PlanRequest) -> Plan | NoPlan:
+    def _bounds(self, motion: Motion, origin: int, destination: int) -> tuple[Bounds, int]:
+        """Search without traffic; return what the search with it needs, and the expansions."""
+        while True:
+            sufficed, bounds, expansions = static_search(
+                self._open_links, motion, self._workspace, origin, destination, self._next_stamp()
+            )
+            if sufficed:
+                return bounds, expansions
+            self._workspace = larger_workspace(self._workspace)
+
+    def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds, expansions: int = 0) -> Plan | NoPlan:
         """Search and return the plan, or the error that says why there is none."""
-        motion = self._motion(request.performance)
         task = Task(
             request.origin,
             request.destination,
@@ -134,9 +145,11 @@ class Planner:
             self.hover_limit_ms,
             stamp=0,
         )
-        slabs = self.index.slabs
-        kernel = search_kernels.greedy if self.search is Search.GREEDY else search_kernels.safe_interval
-        status, label, expansions, disturbed = self._run(kernel, motion, slabs, task)
+        if self.search is Search.GREEDY:
+            status, label, further = self._run(search_kernels.greedy, motion, task)
+        else:
+            status, label, further = self._run(search_kernels.safe_interval, motion, task, bounds)
+        expansions += further
         if status == search_kernels.NO_DEPARTURE_SLOT:
             owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
             return NoDepartureSlot("the first block is reserved throughout the departure window", owners)
@@ -145,24 +158,24 @@ class Planner:
                 "no conflict-free path leads from the first block within the departure window",
                 self._owners_around(label),
             )
-        plan = self._plan(motion, task, label, expansions, disturbed)
+        plan = self._plan(motion, task, bounds, label, expansions)
         endurance = request.performance.endurance_ms
         if endurance is None or plan.flight_time_ms <= endurance:
             return plan
         if self.search is Search.SAFE_INTERVAL:
-            status, label, further, _ = self._run(within_endurance, motion, slabs, task, endurance)
+            status, label, further = self._run(within_endurance, motion, task, bounds, endurance)
             if status == search_kernels.FOUND:
-                return self._plan(motion, task, label, expansions + further, disturbed=True)
+                return self._plan(motion, task, bounds, label, expansions + further)
         return EnduranceExceeded(
             f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s"
         )
 
-    def _earliest_feasible_departure(self, request: PlanRequest) -> int | None:
+    def _earliest_feasible_departure(self, request: PlanRequest, motion: Motion, bounds: Bounds) -> int | None:
         """Return the earliest departure after the request's window from which there is a plan, None if none is near."""
         earliest = None
         latest = request.latest_departure_ms + _OUTLOOK_MS
         while latest > request.latest_departure_ms:
-            later = self._search(replace(request, latest_departure_ms=latest))
+            later = self._search(replace(request, latest_departure_ms=latest), motion, bounds)
             if isinstance(later, NoPlan):
                 break
             # Who departs as soon as the first block is free may have to hover, which an endurance may not allow.
@@ -185,25 +198,28 @@ class Planner:
 
     def _run(
         self,
-        kernel: Callable[..., tuple[int, int, int, bool]],
+        kernel: Callable[..., tuple[int, int, int]],
         motion: Motion,
-        slabs: Slabs,
         task: Task,
-        *rest: int,
-    ) -> tuple[int, int, int, bool]:
+        *rest: Bounds | int,
+    ) -> tuple[int, int, int]:
         """Run a search kernel, with a larger workspace as often as it asks for one."""
         while True:
             stamped = task._replace(stamp=self._next_stamp())
-            outcome = kernel(self._open_links, motion, slabs, self._workspace, stamped, *rest)
+            outcome = kernel(self._open_links, motion, self.index.slabs, self._workspace, stamped, *rest)
             if outcome[0] != search_kernels.WORKSPACE_FULL:
                 return outcome
-            self._workspace = new_workspace(len(self._components), 2 * len(self._workspace.labels))
+            self._workspace = larger_workspace(self._workspace)
 
     def _next_stamp(self) -> int:
+        if self._stamp == LAST_STAMP:
+            self._workspace.marks[:] = 0
+            self._workspace.field[:] = 0
+            self._stamp = 0
         self._stamp += 1
         return self._stamp
 
-    def _plan(self, motion: Motion, task: Task, goal: int, expansions: int, disturbed: bool) -> Plan:
+    def _plan(self, motion: Motion, task: Task, bounds: Bounds, goal: int, expansions: int) -> Plan:
         """Turn the labels of a finished search into a plan."""
         ws = self._workspace
         block, arrive, depart, gap_end = path_kernels.trace(ws.labels, goal, task)
@@ -214,7 +230,6 @@ class Planner:
         hold_block, hold_enter, hold_exit = path_kernels.holds(
             motion, ws.marks, self._next_stamp(), block, arrive, depart
         )
-        undisturbed_ms = int(depart[-1]) - task.earliest
         return Plan(
             block=block,
             arrive_ms=arrive,
@@ -224,14 +239,10 @@ class Planner:
             hold_exit_ms=hold_exit,
             earliest_departure_ms=task.earliest,
             slot_opens_ms=slot_opens_ms,
-            unconstrained_ms=self._unconstrained(motion, task) if disturbed else undisturbed_ms,
+            unconstrained_ms=bounds.optimum + 2 * task.dwell,
             terminal_dwell_ms=task.dwell,
             expansions=expansions,
         )
-
-    def _unconstrained(self, motion: Motion, task: Task) -> int:
-        _, goal, _, _ = self._run(search_kernels.greedy, motion, self._empty, task)
-        return int(self._workspace.labels[goal, label_columns.G]) + task.dwell - task.earliest
 
     def _motion(self, performance: Performance) -> Motion:
         key = performance.times[1:]

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from planner.airmatrix import IntArray
+from planner.airmatrix import Int32Array, IntArray
 from planner.airspace import Airspace, OccupancyRule
 from planner.errors import AircraftProfileError, Block
 from planner.heuristic import lattice_distance
 from planner.kernels import intervals
 from planner.kernels.heap import MAX_H
-from planner.kernels.motion import BOX, LEAD, OFFSET, TAIL, TIME, Motion, Shape
+from planner.kernels.motion import LEAD, MOST_SIDES, OFFSET, SIDE, SIDES, TAIL, TIME, Motion, Shape
 from planner.links import DIRECTIONS, LINK_COUNT, LinkTimes, box_steps, build_offsets
 
 _LINK_OF = {direction: link for link, direction in enumerate(DIRECTIONS)}
@@ -74,16 +74,16 @@ def boxes(rule: OccupancyRule) -> list[list[Block]]:
     return [[(0, 0, 0), direction] for direction in DIRECTIONS]
 
 
-def open_links(airspace: Airspace) -> IntArray:
+def open_links(airspace: Airspace) -> Int32Array:
     """Return for each block, as 26 bits, the links that stay in the grid and, under its rule, cut no building."""
     count_i, count_j, count_k = airspace.grid.dimensions
     free = np.pad(~airspace.occupied.reshape(count_k, count_j, count_i), 1)
-    bits = np.zeros((count_k, count_j, count_i), dtype=np.int64)
+    bits = np.zeros((count_k, count_j, count_i), dtype=np.int32)
     for link, box in enumerate(boxes(airspace.rule)):
         is_open = np.ones_like(bits, dtype=np.bool_)
         for i, j, k in box:
             is_open &= free[1 + k : 1 + k + count_k, 1 + j : 1 + j + count_j, 1 + i : 1 + i + count_i]
-        bits |= is_open.astype(np.int64) << link
+        bits |= is_open.astype(np.int32) << link
     return bits.ravel()
 
 
@@ -94,16 +94,17 @@ def build_motion(times: LinkTimes, airspace: Airspace) -> Motion:
     """
     count_i, count_j, count_k = airspace.grid.dimensions
     distance = lattice_distance(times, count_k)
-    reach = int(times.time.max())
-    if int(distance.near.max()) + (count_i + count_j) * reach > MAX_H:
+    if int(distance.near.max()) + (count_i + count_j) * int(times.time.max()) > MAX_H:
         raise AircraftProfileError("too slow: flights across this airspace would take longer than the search can order")
     contained = airspace.rule is OccupancyRule.CONTAINMENT
-    links = np.zeros((LINK_COUNT, 5), dtype=np.int64)
+    links = np.zeros((LINK_COUNT, SIDE + MOST_SIDES), dtype=np.int64)
     links[:, OFFSET] = build_offsets(airspace.grid)
     links[:, TIME] = times.time
     links[:, LEAD] = 0 if contained else times.time // 2
     links[:, TAIL] = times.time if contained else times.time // 2
     for link, box in enumerate(boxes(airspace.rule)):
-        links[link, BOX] = sum(1 << _LINK_OF[step] for step in box if step != (0, 0, 0))
-    shape = Shape(count_i, count_j, distance.horizontal, distance.diagonal, reach)
+        sides = [_LINK_OF[step] for step in box if step not in ((0, 0, 0), DIRECTIONS[link])]
+        links[link, SIDES] = len(sides)
+        links[link, SIDE : SIDE + len(sides)] = sides
+    shape = Shape(count_i, count_j, distance.horizontal, distance.diagonal)
     return Motion(shape, links, distance.near)

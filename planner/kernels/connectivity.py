@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from planner.airmatrix import IntArray
-from planner.kernels.policy import kernel
+from planner.airmatrix import Int32Array, IntArray
+from planner.kernels.policy import allocating_kernel
 
 
-@kernel
-def label_components(open_links: IntArray, offset: IntArray) -> IntArray:
+@allocating_kernel
+def label_components(open_links: Int32Array, offset: IntArray) -> IntArray:
     """Number the connected components of blocks under open links (26 bits a block), by flooding."""
     component = np.full(open_links.shape[0], -1, dtype=np.int64)
     waiting = np.empty(open_links.shape[0], dtype=np.int64)

@@ -1,7 +1,7 @@
 """The search within the endurance, for when the earliest arrival of all takes longer (docs/decisions/0005)."""
 
-from planner.airmatrix import IntArray
-from planner.kernels.heap import pop
+from planner.airmatrix import Int32Array, IntArray
+from planner.kernels.heap import ITEM, pop
 from planner.kernels.intervals import COUNT, ENTER, FAR_FUTURE, FIRST, Slabs, ended_by
 from planner.kernels.labels import (
     BLOCK,
@@ -21,31 +21,30 @@ from planner.kernels.labels import (
     can_end,
     gap_bounds,
 )
-from planner.kernels.motion import BOX, OFFSET, TAIL, TIME, Motion, first_start, heuristic, look_around
+from planner.kernels.motion import OFFSET, SIDE, SIDES, STEPS, TAIL, TIME, Motion, coordinates, first_start
 from planner.kernels.policy import kernel
 from planner.kernels.search import FOUND, NO_PATH, WORKSPACE_FULL, open_departures, open_label
+from planner.kernels.static_search import Bounds, time_to_go
 
 
 @kernel
-def window_end(links: IntArray, table: IntArray, pool: IntArray, p: int, link: int, g: int, s: int, last: int) -> int:
+def window_end(links: IntArray, table: Int32Array, pool: IntArray, p: int, link: int, g: int, s: int, last: int) -> int:
     """Return the last start up to which all starts from the feasible start s on are feasible too."""
     duration = links[link, TIME] + 1
     n = p + links[link, OFFSET]
     if g < table[n, COUNT]:
         last = min(last, pool[table[n, FIRST] + g, ENTER] - duration)
-    sides = links[link, BOX] & ~(1 << link)
-    for side in range(26):
-        if (sides >> side) & 1:
-            block = p + links[side, OFFSET]
-            ended = ended_by(table, pool, block, s)
-            if ended < table[block, COUNT]:
-                last = min(last, pool[table[block, FIRST] + ended, ENTER] - duration)
+    for place in range(SIDE, SIDE + links[link, SIDES]):
+        block = p + links[links[link, place], OFFSET]
+        ended = ended_by(table, pool, block, s)
+        if ended < table[block, COUNT]:
+            last = min(last, pool[table[block, FIRST] + ended, ENTER] - duration)
     return last
 
 
 @kernel
 def is_dominated(
-    marks: IntArray,
+    marks: Int32Array,
     labels: IntArray,
     stamp: int,
     block: int,
@@ -70,8 +69,8 @@ def is_dominated(
 
 @kernel
 def within_endurance(
-    open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, task: Task, endurance: int
-) -> tuple[int, int, int, bool]:
+    open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, task: Task, bounds: Bounds, endurance: int
+) -> tuple[int, int, int]:
     """The earliest arrival with arrival - departure within `endurance`, for when the earliest of all takes longer.
 
     A label is a set of departures: leaving at D up to `departure` arrives at max(G, D + `flown`). Every window of
@@ -80,33 +79,38 @@ def within_endurance(
     """
     shape, links, near = motion
     table, pool, _ = slabs
-    marks, labels, heap, around = ws
-    count = open_departures(shape, near, table, pool, marks, labels, task)
+    marks, labels, _, around, _, heap, _, field = ws
+    i, j, k = bounds.start
+    h, _ = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
+    count = open_departures(h, table, pool, marks, labels, task)
     size = 0
     for label in range(count):
         labels[label, DEPARTURE] = min(task.latest, labels[label, GAP_END] - 1 - task.dwell)
         labels[label, FLOWN] = task.dwell
-        size = open_label(heap, size, labels, label, task.earliest)
+        size = open_label(heap, size, labels, label, labels[label, G] + h, h, task.earliest)
     expansions = 0
     while size > 0:
-        label = pop(heap, size, labels)
-        size -= 1
+        label = heap[0, ITEM]
+        size = pop(heap, size)
         if can_end(labels, label, task):
-            return FOUND, label, expansions, True
+            return FOUND, label, expansions
         expansions += 1
         p = labels[label, BLOCK]
-        look_around(open_links, links, table, pool, around, p, labels[label, G], shape.reach)
+        i, j, k = coordinates(shape, p)
+        for link in range(26):
+            around[link] = -1
         for link in range(26):
             if not (open_links[p] >> link) & 1:
                 continue
             last = labels[label, GAP_END] - 1 - links[link, TAIL]
             n = p + links[link, OFFSET]
-            h = heuristic(shape, near, n, task.destination)
+            x, y, z = i + STEPS[link, 0], j + STEPS[link, 1], k + STEPS[link, 2]
+            h, _ = time_to_go(field, shape, near, bounds, n, x, y, z)
             in_air = endurance - task.dwell - h
             flown = labels[label, FLOWN] + links[link, TIME]
             tau = labels[label, G]
             while tau <= last and flown <= in_air:
-                s, g = first_start(links, table, pool, around, p, link, 0, tau, last)
+                s, g = first_start(links, table, pool, around, p, link, 0, labels[label, G], tau, last)
                 arrival = s + links[link, TIME]
                 if s == FAR_FUTURE or arrival - labels[label, DEPARTURE] > in_air:
                     break
@@ -116,7 +120,7 @@ def within_endurance(
                     marks, labels, task.stamp, n, g, arrival, departure, flown
                 ):
                     if count == labels.shape[0] or size == heap.shape[0]:
-                        return WORKSPACE_FULL, -1, expansions, True
+                        return WORKSPACE_FULL, -1, expansions
                     start, end = gap_bounds(table, pool, n, g, task.earliest)
                     add_label(marks, labels, task.stamp, count, n, g, start, end, h)
                     labels[count, G] = arrival
@@ -124,7 +128,7 @@ def within_endurance(
                     labels[count, FLOWN] = flown
                     labels[count, PARENT] = label
                     labels[count, START] = s
-                    size = open_label(heap, size, labels, count, task.earliest)
+                    size = open_label(heap, size, labels, count, arrival + h, h, task.earliest)
                     count += 1
                 tau = until + 1
-    return NO_PATH, count, expansions, True
+    return NO_PATH, count, expansions

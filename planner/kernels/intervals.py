@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planner.airmatrix import IntArray
+from planner.airmatrix import Int32Array, IntArray
 from planner.kernels.policy import kernel
 
 FAR_FUTURE = 1 << 62
@@ -19,7 +19,7 @@ SIZE_CLASSES = 40
 
 
 # Columns of `table` (a row a block), and of `pool` (a row a reservation).
-FIRST, COUNT, SIZE_CLASS = range(3)
+FIRST, COUNT, SIZE_CLASS, LAST = range(4)
 ENTER, EXIT, OWNER = range(3)
 
 
@@ -30,7 +30,7 @@ class Slabs(NamedTuple):
     handed out. Kernels get the arrays one by one: numba counts references each time it takes one out of a tuple.
     """
 
-    table: IntArray
+    table: Int32Array
     pool: IntArray
     chains: IntArray
 
@@ -39,23 +39,44 @@ def empty_slabs(block_count: int, pool_size: int) -> Slabs:
     """Return an index of `block_count` blocks without reservations."""
     chains = np.full(SIZE_CLASSES + 1, -1, dtype=np.int64)
     chains[-1] = 0
-    table = np.zeros((block_count, 3), dtype=np.int64)
+    table = np.zeros((block_count, 4), dtype=np.int32)
     table[:, FIRST] = -1
     return Slabs(table, np.empty((pool_size, 3), dtype=np.int64), chains)
 
 
 @kernel
-def ended_by(table: IntArray, pool: IntArray, block: int, time: int) -> int:
-    """Return how many of a block's reservations have ended by `time`: the gap or reservation that holds it."""
-    start = table[block, FIRST]
-    low, high = start, start + table[block, COUNT]
+def ended_by(table: Int32Array, pool: IntArray, block: int, time: int) -> int:
+    """Return how many of a block's reservations have ended by `time`: the gap or reservation that holds it.
+
+    Searches ask for the same block at nearby times again and again, so it looks near the last answer first.
+    """
+    first, count = table[block, FIRST], table[block, COUNT]
+    if count == 0:
+        return 0
+    low, high = 0, count
+    guess = min(table[block, LAST], count)
+    if guess < count and pool[first + guess, EXIT] <= time:
+        low = guess + 1
+        step = 1
+        while low + step <= high and pool[first + low + step - 1, EXIT] <= time:
+            low += step
+            step *= 2
+        high = min(high, low + step - 1)
+    else:
+        high = guess
+        step = 1
+        while high - step >= low and pool[first + high - step, EXIT] > time:
+            high -= step
+            step *= 2
+        low = max(low, high - step + 1)
     while low < high:
         middle = (low + high) >> 1
-        if pool[middle, EXIT] <= time:
+        if pool[first + middle, EXIT] <= time:
             low = middle + 1
         else:
             high = middle
-    return low - start
+    table[block, LAST] = low
+    return low
 
 
 @kernel
@@ -89,7 +110,7 @@ def move(pool: IntArray, source: int, target: int) -> None:
 
 
 @kernel
-def make_room(table: IntArray, pool: IntArray, chains: IntArray, block: int) -> bool:
+def make_room(table: Int32Array, pool: IntArray, chains: IntArray, block: int) -> bool:
     """Make room for one more reservation in the block's slab; False if the pool is exhausted."""
     first, count, size_class = table[block, FIRST], table[block, COUNT], table[block, SIZE_CLASS]
     if first >= 0 and count < SMALLEST_SLAB << size_class:
@@ -108,7 +129,7 @@ def make_room(table: IntArray, pool: IntArray, chains: IntArray, block: int) -> 
 
 
 @kernel
-def first_overlap(table: IntArray, pool: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray) -> int:
+def first_overlap(table: Int32Array, pool: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray) -> int:
     """Return the position of the first given interval that overlaps a reservation, -1 if none does."""
     for n in range(blocks.shape[0]):
         block = blocks[n]
@@ -120,7 +141,7 @@ def first_overlap(table: IntArray, pool: IntArray, blocks: IntArray, enters: Int
 
 @kernel
 def insert(
-    table: IntArray,
+    table: Int32Array,
     pool: IntArray,
     chains: IntArray,
     blocks: IntArray,
@@ -146,7 +167,7 @@ def insert(
 
 
 @kernel
-def drop_range(table: IntArray, pool: IntArray, chains: IntArray, block: int, start: int, stop: int) -> None:
+def drop_range(table: Int32Array, pool: IntArray, chains: IntArray, block: int, start: int, stop: int) -> None:
     """Drop a block's reservations start … stop - 1; an empty block gives its slab back."""
     first, count = table[block, FIRST], table[block, COUNT]
     gone = stop - start
@@ -161,7 +182,7 @@ def drop_range(table: IntArray, pool: IntArray, chains: IntArray, block: int, st
 
 @kernel
 def remove(
-    table: IntArray, pool: IntArray, chains: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray
+    table: Int32Array, pool: IntArray, chains: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray
 ) -> int:
     """Remove the given intervals where they are present exactly; return how many were."""
     removed = 0
@@ -176,7 +197,7 @@ def remove(
 
 
 @kernel
-def forget(table: IntArray, pool: IntArray, chains: IntArray, time: int) -> int:
+def forget(table: Int32Array, pool: IntArray, chains: IntArray, time: int) -> int:
     """Drop every reservation that has ended by `time`; return how many."""
     dropped = 0
     for block in range(table.shape[0]):

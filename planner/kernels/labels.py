@@ -8,16 +8,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from planner.airmatrix import IntArray
+from planner.airmatrix import Int32Array, IntArray
+from planner.kernels.heap import HEAP_COLUMNS
 from planner.kernels.intervals import COUNT, ENTER, EXIT, FAR_FUTURE, FIRST
 from planner.kernels.policy import kernel
 
 # Columns of `Workspace.labels`, a row a label.
-G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, CLOSED, RESUME, DEPARTURE, FLOWN = range(13)
+G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, CLOSED, QUEUED, DEPARTURE, FLOWN = range(13)
 LABEL_COLUMNS = 13
 
 # Columns of `Workspace.marks`, a row a block: the search that last touched it, and its first label there.
 STAMP, HEAD = range(2)
+
+# The largest stamp: twice as much and one must fit into int32.
+LAST_STAMP = (1 << 30) - 1
 
 
 class Task(NamedTuple):
@@ -35,29 +39,45 @@ class Task(NamedTuple):
 class Workspace(NamedTuple):
     """Memory that searches share, one at a time; stamps say what belongs to the present search.
 
-    `labels` (n, 13) by the columns above: G, H, block, gap number and bounds, parent label, the
-    start of the link from it, the block's `following` label, `closed`, `resume` (see `safe_interval`), `departure`
-    and `flown` (see `within_endurance`). `around` (26,): the gap number at each neighbour of the block expanded.
+    `labels` (n, 13) by the columns above: G, H, block, gap number and bounds, parent label, the start of the link from
+    it, the block's `following` label, `closed`, the key it is `queued` under, `departure` and `flown` (see
+    `within_endurance`). `pending` (n, 26): by how much the next arrival by each link would exceed F. Of the
+    neighbours of the block expanded, `around` (26,): the gap; `to_go` (26, 2): H, and the rank among equal F.
+    `field` (blocks, 4) and `far_heap` serve `planner.kernels.static_search`.
     """
 
-    marks: IntArray
+    marks: Int32Array
     labels: IntArray
-    heap: IntArray
+    pending: Int32Array
     around: IntArray
+    to_go: IntArray
+    heap: IntArray
+    far_heap: IntArray
+    field: Int32Array
 
 
 def new_workspace(block_count: int, label_count: int) -> Workspace:
     """Return memory for searches of up to `label_count` labels."""
     return Workspace(
-        marks=np.zeros((block_count, 2), dtype=np.int64),
+        marks=np.zeros((block_count, 2), dtype=np.int32),
         labels=np.empty((label_count, LABEL_COLUMNS), dtype=np.int64),
-        heap=np.empty((4 * label_count, 2), dtype=np.int64),
+        pending=np.empty((label_count, 26), dtype=np.int32),
         around=np.zeros(26, dtype=np.int64),
+        to_go=np.zeros((26, 2), dtype=np.int64),
+        heap=np.empty((4 * label_count, HEAP_COLUMNS), dtype=np.int64),
+        far_heap=np.empty((4 * label_count, HEAP_COLUMNS), dtype=np.int64),
+        field=np.zeros((block_count, 4), dtype=np.int32),
     )
 
 
+def larger_workspace(ws: Workspace) -> Workspace:
+    """Return memory for twice as many labels, with the marks that this one holds."""
+    larger = new_workspace(0, 2 * len(ws.labels))
+    return larger._replace(marks=ws.marks, field=ws.field)
+
+
 @kernel
-def gap_bounds(table: IntArray, pool: IntArray, block: int, gap: int, earliest: int) -> tuple[int, int]:
+def gap_bounds(table: Int32Array, pool: IntArray, block: int, gap: int, earliest: int) -> tuple[int, int]:
     """Return a gap's start and end; starts before `earliest` are that, so that forgetting the past changes nothing."""
     first = table[block, FIRST]
     start, end = earliest, FAR_FUTURE
@@ -69,7 +89,7 @@ def gap_bounds(table: IntArray, pool: IntArray, block: int, gap: int, earliest: 
 
 
 @kernel
-def label_for(marks: IntArray, labels: IntArray, stamp: int, block: int, gap: int) -> int:
+def label_for(marks: Int32Array, labels: IntArray, stamp: int, block: int, gap: int) -> int:
     """Return the label of a gap in this search, -1 if it has none yet."""
     if marks[block, STAMP] != stamp:
         return -1
@@ -81,7 +101,7 @@ def label_for(marks: IntArray, labels: IntArray, stamp: int, block: int, gap: in
 
 @kernel
 def add_label(
-    marks: IntArray,
+    marks: Int32Array,
     labels: IntArray,
     stamp: int,
     label: int,

@@ -1,31 +1,36 @@
-"""Leaving a block: which links are open, and from when on their holds are free.
+"""Leaving a block: how far the destination is, and from when on a link's holds are free.
 
 Under either occupancy rule the hold of block p ends `tail` after the start s of a link, and the hold of its neighbour n
-begins `lead` after s.
+begins `lead` after s. Under containment the side blocks, the rest of the box, are held from s to the arrival.
 """
 
 from typing import NamedTuple
 
-from planner.airmatrix import IntArray
+import numpy as np
+
+from planner.airmatrix import Int32Array, IntArray
 from planner.kernels.intervals import COUNT, ENTER, EXIT, FAR_FUTURE, FIRST, ended_by
 from planner.kernels.policy import kernel
+from planner.links import DIRECTIONS
 
-# Columns of `Motion.links`, a row a link; BOX has a bit for each link whose neighbour is held during this one.
-OFFSET, BOX, TIME, LEAD, TAIL = range(5)
+# Columns of `Motion.links`, a row a link: how many side blocks it has, and from SIDE on the links that lead to them.
+OFFSET, TIME, LEAD, TAIL, SIDES, SIDE = range(6)
+MOST_SIDES = 6
+
+STEPS = np.array(DIRECTIONS, dtype=np.int64)
 
 
 class Shape(NamedTuple):
-    """Numbers about the grid and the aircraft: block counts, lattice steps beyond `near`, the longest link (ms)."""
+    """Numbers about the grid and the aircraft: block counts, lattice steps beyond `near` (ms)."""
 
     count_i: int
     count_j: int
     horizontal: int
     diagonal: int
-    reach: int
 
 
 class Motion(NamedTuple):
-    """One aircraft in one airspace: `links` (26, 5), `near` as in `planner.heuristic`."""
+    """One aircraft in one airspace: `links` (26, 11), `near` as in `planner.heuristic`."""
 
     shape: Shape
     links: IntArray
@@ -33,13 +38,17 @@ class Motion(NamedTuple):
 
 
 @kernel
-def heuristic(shape: Shape, near: IntArray, block: int, destination: int) -> int:
-    """Return H: the lattice distance in ms between two blocks (see `planner.heuristic`)."""
-    row, x = block // shape.count_i, block % shape.count_i
-    row_D, x_D = destination // shape.count_i, destination % shape.count_i
-    z = abs(row // shape.count_j - row_D // shape.count_j)
-    y = abs(row % shape.count_j - row_D % shape.count_j)
-    x = abs(x - x_D)
+def coordinates(shape: Shape, block: int) -> tuple[int, int, int]:
+    """Return (i, j, k) of a flat index."""
+    row = block // shape.count_i
+    k = row // shape.count_j
+    return block - row * shape.count_i, row - k * shape.count_j, k
+
+
+@kernel
+def lattice_time(shape: Shape, near: IntArray, i: int, j: int, k: int) -> int:
+    """Return the lattice distance in ms over so many blocks (see `planner.heuristic`)."""
+    x, y, z = abs(i), abs(j), abs(k)
     m, q = min(x, y), abs(x - y)
     beyond = 0
     last_m, last_q = near.shape[1] - 1, near.shape[2] - 1
@@ -53,76 +62,46 @@ def heuristic(shape: Shape, near: IntArray, block: int, destination: int) -> int
 
 
 @kernel
-def look_around(
-    open_links: IntArray,
-    links: IntArray,
-    table: IntArray,
-    pool: IntArray,
-    around: IntArray,
-    p: int,
-    tau: int,
-    reach: int,
-) -> int:
-    """Find the gap at time `tau` of p's every neighbour; return as bits those reserved within `reach` of it."""
-    busy = 0
-    for link in range(26):
-        if (open_links[p] >> link) & 1:
-            n = p + links[link, OFFSET]
-            g = 0
-            if table[n, COUNT] > 0:
-                g = ended_by(table, pool, n, tau)
-                if g < table[n, COUNT] and pool[table[n, FIRST] + g, ENTER] <= tau + reach:
-                    busy |= 1 << link
-            around[link] = g
-    return busy
+def heuristic(shape: Shape, near: IntArray, block: int, destination: int) -> int:
+    """Return the paper's H, the lattice distance in ms between two blocks."""
+    i, j, k = coordinates(shape, block)
+    i_D, j_D, k_D = coordinates(shape, destination)
+    return lattice_time(shape, near, i - i_D, j - j_D, k - k_D)
 
 
 @kernel
-def wait_for_sides(
-    links: IntArray,
-    table: IntArray,
-    pool: IntArray,
-    around: IntArray,
-    p: int,
-    sides: int,
-    s: int,
-    duration: int,
-) -> int:
-    """Return s or, if a side block is reserved within `duration` of it, a later time before which no start is free."""
-    for link in range(26):
-        if (sides >> link) & 1:
-            block = p + links[link, OFFSET]
-            first = table[block, FIRST]
-            for slot in range(first + around[link], first + table[block, COUNT]):
-                if pool[slot, ENTER] >= s + duration:
-                    break
-                s = max(s, pool[slot, EXIT])
-    return s
+def gap_around(table: Int32Array, pool: IntArray, around: IntArray, link: int, block: int, time: int) -> int:
+    """Return the gap at `time` of the block that `link` leads to; `around` remembers it, -1 for not yet looked up."""
+    g = around[link]
+    if g < 0:
+        g = ended_by(table, pool, block, time)
+        around[link] = g
+    return g
 
 
 @kernel
 def first_start(
     links: IntArray,
-    table: IntArray,
+    table: Int32Array,
     pool: IntArray,
     around: IntArray,
     p: int,
     link: int,
     stay: int,
     tau: int,
+    earliest: int,
     last: int,
 ) -> tuple[int, int]:
-    """Return the earliest start of a link in [tau, last] with all its holds free, and the neighbour's gap.
+    """Return the earliest start of a link in [earliest, last] with all its holds free, and the neighbour's gap.
 
-    The neighbour must be free for `stay` ms more. FAR_FUTURE if there is no such start. `look_around` must have been
-    called for p at tau or earlier.
+    The neighbour must be free for `stay` ms more. FAR_FUTURE if there is no such start. `around` holds what gaps there
+    are at `tau`, which is `earliest` or before.
     """
     n = p + links[link, OFFSET]
     first, count = table[n, FIRST], table[n, COUNT]
     lead, duration = links[link, LEAD], links[link, TIME] + 1
-    sides = links[link, BOX] & ~(1 << link)
-    g = around[link]
-    s = tau
+    g = gap_around(table, pool, around, link, n, tau)
+    s = earliest
     while True:
         if g > 0:
             s = max(s, pool[first + g - 1, EXIT] - lead)
@@ -131,7 +110,23 @@ def first_start(
         if g < count and pool[first + g, ENTER] < s + duration + stay:
             g += 1
             continue
-        free_from = wait_for_sides(links, table, pool, around, p, sides, s, duration)
+        free_from = s
+        for place in range(SIDE, SIDE + links[link, SIDES]):
+            side = links[link, place]
+            block = p + links[side, OFFSET]
+            at_tau = gap_around(table, pool, around, side, block, tau)
+            free_from = wait_for(table, pool, block, at_tau, free_from, duration)
         if free_from == s:
             return s, g
         s = free_from
+
+
+@kernel
+def wait_for(table: Int32Array, pool: IntArray, block: int, g: int, s: int, duration: int) -> int:
+    """Return s or, if a block is reserved within `duration` of it, when it is free that long; look from gap g on."""
+    first = table[block, FIRST]
+    for slot in range(first + g, first + table[block, COUNT]):
+        if pool[slot, ENTER] >= s + duration:
+            break
+        s = max(s, pool[slot, EXIT])
+    return s

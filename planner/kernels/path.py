@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from planner.airmatrix import IntArray
+from planner.airmatrix import Int32Array, IntArray
 from planner.kernels.intervals import COUNT, ENTER, FIRST, Slabs, ended_by
 from planner.kernels.labels import BLOCK, GAP_END, HEAD, PARENT, STAMP, START, G, Task
-from planner.kernels.motion import BOX, LEAD, OFFSET, TAIL, TIME, Motion, Shape
-from planner.kernels.policy import kernel
+from planner.kernels.motion import LEAD, OFFSET, SIDE, SIDES, TAIL, TIME, Motion, Shape, coordinates
+from planner.kernels.policy import allocating_kernel, kernel
 
 
-@kernel
+@allocating_kernel
 def trace(labels: IntArray, goal: int, task: Task) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Follow parents from the goal; return blocks, arrivals, departures and the ends of the free intervals.
 
@@ -40,34 +40,30 @@ def trace(labels: IntArray, goal: int, task: Task) -> tuple[IntArray, IntArray, 
 @kernel
 def link_between(shape: Shape, p: int, n: int) -> int:
     """Return the link from p to its neighbour n. In narrow grids offsets coincide, so coordinates decide."""
-    row_p, row_n = p // shape.count_i, n // shape.count_i
-    i = n % shape.count_i - p % shape.count_i
-    j = row_n % shape.count_j - row_p % shape.count_j
-    k = row_n // shape.count_j - row_p // shape.count_j
-    code = (i + 1) * 9 + (j + 1) * 3 + (k + 1)
+    i_p, j_p, k_p = coordinates(shape, p)
+    i_n, j_n, k_n = coordinates(shape, n)
+    code = (i_n - i_p + 1) * 9 + (j_n - j_p + 1) * 3 + (k_n - k_p + 1)
     return code if code < 13 else code - 1
 
 
 @kernel
 def latest_start(
-    links: IntArray, table: IntArray, pool: IntArray, p: int, link: int, earliest: int, latest: int
+    links: IntArray, table: Int32Array, pool: IntArray, p: int, link: int, earliest: int, latest: int
 ) -> int:
     """Return the latest start of a link in [earliest, latest] with its side blocks free; `earliest` must be one."""
     duration = links[link, TIME] + 1
-    sides = links[link, BOX] & ~(1 << link)
     s = latest
     moved = True
     while moved and s > earliest:
         moved = False
-        for side in range(26):
-            if (sides >> side) & 1:
-                block = p + links[side, OFFSET]
-                first = table[block, FIRST]
+        for place in range(SIDE, SIDE + links[link, SIDES]):
+            block = p + links[links[link, place], OFFSET]
+            first = table[block, FIRST]
+            g = ended_by(table, pool, block, s)
+            while g < table[block, COUNT] and pool[first + g, ENTER] < s + duration:
+                s = pool[first + g, ENTER] - duration
+                moved = True
                 g = ended_by(table, pool, block, s)
-                while g < table[block, COUNT] and pool[first + g, ENTER] < s + duration:
-                    s = pool[first + g, ENTER] - duration
-                    moved = True
-                    g = ended_by(table, pool, block, s)
     return s
 
 
@@ -96,9 +92,9 @@ def hold_on_ground(arrive: IntArray, depart: IntArray, task: Task) -> None:
     arrive[0] = max(arrive[0], min(task.latest, depart[0] - task.dwell))
 
 
-@kernel
+@allocating_kernel
 def holds(
-    motion: Motion, marks: IntArray, stamp: int, block: IntArray, arrive: IntArray, depart: IntArray
+    motion: Motion, marks: Int32Array, stamp: int, block: IntArray, arrive: IntArray, depart: IntArray
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Return the holds of a path (block, enter, exit), overlapping ones of a block merged, by enter, i, j, k."""
     shape, links, _ = motion
@@ -113,17 +109,16 @@ def holds(
             break
         link = link_between(shape, p, block[place + 1])
         count = add_hold(marks, stamp, held, count, p, begins, s + links[link, TAIL] + 1)
-        sides = links[link, BOX] & ~(1 << link)
-        for side in range(26):
-            if (sides >> side) & 1:
-                count = add_hold(marks, stamp, held, count, p + links[side, OFFSET], s, s + links[link, TIME] + 1)
+        for place_in_box in range(SIDE, SIDE + links[link, SIDES]):
+            side = p + links[links[link, place_in_box], OFFSET]
+            count = add_hold(marks, stamp, held, count, side, s, s + links[link, TIME] + 1)
         begins = s + links[link, LEAD]
     sort_holds(shape, marks.shape[0], held, count)
     return held[:count, 0].copy(), held[:count, 1].copy(), held[:count, 2].copy()
 
 
 @kernel
-def add_hold(marks: IntArray, stamp: int, held: IntArray, count: int, block: int, begins: int, ends: int) -> int:
+def add_hold(marks: Int32Array, stamp: int, held: IntArray, count: int, block: int, begins: int, ends: int) -> int:
     """Add a hold, or extend its block's newest one if they overlap; return the new count. Holds come by `begins`."""
     if marks[block, STAMP] == stamp:
         newest = marks[block, HEAD]
@@ -141,9 +136,8 @@ def add_hold(marks: IntArray, stamp: int, held: IntArray, count: int, block: int
 @kernel
 def column_order(shape: Shape, block_count: int, block: int) -> int:
     """Return a block's rank by i, then j, then k."""
-    row, i = block // shape.count_i, block % shape.count_i
-    layers = block_count // (shape.count_i * shape.count_j)
-    return (i * shape.count_j + row % shape.count_j) * layers + row // shape.count_j
+    i, j, k = coordinates(shape, block)
+    return (i * shape.count_j + j) * (block_count // (shape.count_i * shape.count_j)) + k
 
 
 @kernel
@@ -157,7 +151,8 @@ def sort_holds(shape: Shape, block_count: int, held: IntArray, count: int) -> No
             held[place - 1, 1] > begins
             or (held[place - 1, 1] == begins and column_order(shape, block_count, held[place - 1, 0]) > rank)
         ):
-            held[place] = held[place - 1]
+            for column in range(3):
+                held[place, column] = held[place - 1, column]
             place -= 1
         held[place, 0] = block
         held[place, 1] = begins

@@ -1,4 +1,4 @@
-"""The one way kernels are compiled.
+"""The one place where kernels are compiled.
 
 numba's cache notices a change of the file a kernel stands in, but neither of its callees' files nor of the
 bounds-check flag, and then runs stale machine code. So each state of the sources has a cache folder of its own.
@@ -41,10 +41,23 @@ def is_compiled() -> bool:
 
 
 def kernel(function: Kernel) -> Kernel:
-    """Compile without fastmath, without the GIL, cached. Kernels never divide by zero, so errors follow numpy."""
+    """Compile without fastmath, without the GIL, cached. Kernels never divide by zero, so errors follow numpy.
+
+    A kernel makes no arrays, so nothing in it needs numba's reference counting, which took half of a search's time
+    (docs/decisions/0010); its callers hold the arrays.
+    """
+    return _compile(function, _nrt=False)
+
+
+def allocating_kernel(function: Kernel) -> Kernel:
+    """Compile likewise a kernel that makes arrays."""
+    return _compile(function)
+
+
+def _compile(function: Kernel, **options: Any) -> Kernel:
     before = _config.CACHE_DIR
     _config.CACHE_DIR = str(_CACHE_FOLDER)
     try:
-        return cast(Kernel, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+        return cast(Kernel, cast(Any, numba).njit(cache=True, nogil=True, error_model="numpy", **options)(function))
     finally:
         _config.CACHE_DIR = before

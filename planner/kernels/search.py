@@ -1,7 +1,7 @@
 """CFA* (paper 3.2): `greedy` as its Algorithm 3, `safe_interval` beyond it; both are A* where nothing is reserved."""
 
-from planner.airmatrix import IntArray
-from planner.kernels.heap import heap_key, pop, push
+from planner.airmatrix import Int32Array, IntArray
+from planner.kernels.heap import ITEM, KEY, heap_key, heap_tie, key_f, pop, push
 from planner.kernels.intervals import COUNT, EXIT, FAR_FUTURE, FIRST, Slabs, ended_by
 from planner.kernels.labels import (
     BLOCK,
@@ -12,7 +12,7 @@ from planner.kernels.labels import (
     GAP_START,
     HEAD,
     PARENT,
-    RESUME,
+    QUEUED,
     STAMP,
     START,
     G,
@@ -24,24 +24,40 @@ from planner.kernels.labels import (
     gap_bounds,
     label_for,
 )
-from planner.kernels.motion import BOX, LEAD, OFFSET, TAIL, TIME, Motion, Shape, first_start, heuristic, look_around
+from planner.kernels.motion import (
+    LEAD,
+    OFFSET,
+    STEPS,
+    TAIL,
+    TIME,
+    Motion,
+    coordinates,
+    first_start,
+    gap_around,
+    heuristic,
+)
 from planner.kernels.policy import kernel
+from planner.kernels.static_search import Bounds, time_to_go
 
 FOUND, NO_DEPARTURE_SLOT, NO_PATH, WORKSPACE_FULL = range(4)
+
+# Arrivals within so many ms of the F under way are made at once, rather than come back for each.
+EAGERNESS = 1000
+
+# What no detour (ms, in int32) reaches: 24 days.
+NEVER = (1 << 31) - 1
 
 
 @kernel
 def open_departures(
-    shape: Shape,
-    near: IntArray,
-    table: IntArray,
+    h: int,
+    table: Int32Array,
     pool: IntArray,
-    marks: IntArray,
+    marks: Int32Array,
     labels: IntArray,
     task: Task,
 ) -> int:
     """Make a label for each gap of the first block that allows a departure; return how many."""
-    h = heuristic(shape, near, task.origin, task.destination)
     count = 0
     for gap in range(ended_by(table, pool, task.origin, task.earliest), table[task.origin, COUNT] + 1):
         start, end = gap_bounds(table, pool, task.origin, gap, task.earliest)
@@ -57,134 +73,195 @@ def open_departures(
 
 
 @kernel
-def open_label(heap: IntArray, size: int, labels: IntArray, label: int, earliest: int) -> int:
-    """Put a label on the OpenList; return its new size."""
-    h = labels[label, H]
-    return push(heap, size, labels, heap_key(labels[label, G] + h - earliest, h), label)
+def open_label(heap: IntArray, size: int, labels: IntArray, label: int, f: int, rank: int, earliest: int) -> int:
+    """Queue a label on the OpenList with this F; return the list's new size."""
+    key = heap_key(f - earliest, rank)
+    labels[label, QUEUED] = key
+    return push(heap, size, key, heap_tie(labels[label, BLOCK], labels[label, GAP_START] - earliest), label)
+
+
+@kernel
+def earliest_landing(links: IntArray, table: Int32Array, pool: IntArray, task: Task, soonest: int) -> int:
+    """Return a bound of the arrival at the last block: from the gap on that an arrival at `soonest` could use."""
+    entering = FAR_FUTURE
+    for link in range(26):
+        entering = min(entering, links[link, TIME] - links[link, LEAD])
+    for gap in range(ended_by(table, pool, task.destination, soonest), table[task.destination, COUNT] + 1):
+        start, end = gap_bounds(table, pool, task.destination, gap, task.earliest)
+        landing = max(soonest, start + entering)
+        if landing + task.dwell + 1 <= end:
+            return landing
+    return soonest
+
+
+@kernel
+def undominated_start(
+    links: IntArray,
+    table: Int32Array,
+    pool: IntArray,
+    marks: Int32Array,
+    labels: IntArray,
+    around: IntArray,
+    stamp: int,
+    p: int,
+    link: int,
+    tau: int,
+    earliest: int,
+    last: int,
+) -> tuple[int, int]:
+    """Return as `first_start` does, but FAR_FUTURE if a label reached the neighbour's first gap no later already."""
+    n = p + links[link, OFFSET]
+    first, lead = table[n, FIRST], links[link, LEAD]
+    g = gap_around(table, pool, around, link, n, tau)
+    while g < table[n, COUNT] and pool[first + g, EXIT] - lead <= earliest:
+        g += 1
+    s = earliest
+    if g > 0:
+        s = max(s, pool[first + g - 1, EXIT] - lead)
+    label = label_for(marks, labels, stamp, n, g)
+    if label >= 0 and labels[label, G] <= s + links[link, TIME]:
+        return FAR_FUTURE, g
+    return first_start(links, table, pool, around, p, link, 0, tau, earliest, last)
 
 
 @kernel
 def safe_interval(
-    open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, task: Task
-) -> tuple[int, int, int, bool]:
+    open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, task: Task, bounds: Bounds
+) -> tuple[int, int, int]:
     """CFA* with one label per (block, free interval): the earliest arrival, or proof that there is none.
 
-    An expansion makes at most one successor per link, the earliest; where the neighbour has a later gap within reach
-    of waiting, the label is put back to be resumed at `resume`, the first such start, as if it arrived then. So
-    reservations far in the future cost nothing.
+    Each link of a label has a sequence of arrivals, one per gap of the neighbour, made only when F gets there
+    (partial expansion): a label returns to the OpenList with the least F that its next arrivals can have. So neither
+    links that lead away nor reservations far in the future cost anything.
 
-    Returns status, goal label (without a path, how many labels there are), expansions, and whether traffic changed
-    anything (if not, this was plain A*).
+    Returns status, goal label (without a path, how many labels there are), and expansions.
     """
     shape, links, near = motion
     table, pool, _ = slabs
-    marks, labels, heap, around = ws
-    count = open_departures(shape, near, table, pool, marks, labels, task)
+    marks, labels, pending, around, to_go, heap, _, field = ws
+    i, j, k = bounds.start
+    h, rank = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
+    count = open_departures(h, table, pool, marks, labels, task)
     if count == 0:
-        return NO_DEPARTURE_SLOT, -1, 0, True
-    disturbed = count > 1 or labels[0, START] != task.earliest
+        return NO_DEPARTURE_SLOT, -1, 0
+    landing = earliest_landing(links, table, pool, task, labels[0, G] + h)
     size = 0
     for label in range(count):
-        size = open_label(heap, size, labels, label, task.earliest)
+        size = open_label(heap, size, labels, label, max(labels[label, G] + h, landing), rank, task.earliest)
     expansions = 0
     bound = FAR_FUTURE
+    f_least = key_f(heap[0, KEY])
     while size > 0:
-        item = pop(heap, size, labels)
-        size -= 1
-        label = item if item >= 0 else ~item
-        if item >= 0:
-            if labels[label, CLOSED]:
-                continue
-            labels[label, CLOSED] = 1
-            if can_end(labels, label, task):
-                return FOUND, label, expansions, disturbed
-            disturbed |= labels[label, BLOCK] == task.destination
-            tau = labels[label, G]
-        else:
-            disturbed = True
-            tau = labels[label, RESUME]
+        key, label = heap[0, KEY], heap[0, ITEM]
+        size = pop(heap, size)
+        if key != labels[label, QUEUED]:
+            continue
+        if not labels[label, CLOSED] and can_end(labels, label, task):
+            return FOUND, label, expansions
         expansions += 1
         if count + 26 > labels.shape[0] or size + 27 > heap.shape[0]:
-            return WORKSPACE_FULL, -1, expansions, disturbed
-        p = labels[label, BLOCK]
-        busy = look_around(open_links, links, table, pool, around, p, tau, shape.reach)
-        resume = FAR_FUTURE
+            return WORKSPACE_FULL, -1, expansions
+        p, G_p, end_p = labels[label, BLOCK], labels[label, G], labels[label, GAP_END]
+        F = G_p + labels[label, H]
+        f_now = key_f(key)
+        until = task.earliest + f_now + EAGERNESS + ((f_now - f_least) >> 1) - F
+        is_new = not labels[label, CLOSED]
+        labels[label, CLOSED] = 1
+        i, j, k = coordinates(shape, p)
+        tau = FAR_FUTURE
         for link in range(26):
-            if not (open_links[p] >> link) & 1:
+            around[link] = -1
+            if is_new:
+                if not (open_links[p] >> link) & 1:
+                    pending[label, link] = NEVER
+                    continue
+            elif pending[label, link] > until:
                 continue
-            last = labels[label, GAP_END] - 1 - links[link, TAIL]
-            s, g = tau, around[link]
+            x, y, z = i + STEPS[link, 0], j + STEPS[link, 1], k + STEPS[link, 2]
+            h, rank = time_to_go(field, shape, near, bounds, p + links[link, OFFSET], x, y, z)
+            to_go[link, 0] = h
+            to_go[link, 1] = rank
+            if is_new:
+                pending[label, link] = links[link, TIME] + h - labels[label, H]
+            tau = min(tau, F + pending[label, link] - links[link, TIME] - h)
+        least = NEVER
+        for link in range(26):
+            detour = pending[label, link]
+            if detour > until:
+                least = min(least, detour)
+                continue
+            pending[label, link] = NEVER
+            if detour == NEVER:
+                continue
+            n, h = p + links[link, OFFSET], to_go[link, 0]
+            last = end_p - 1 - links[link, TAIL]
+            s = F + detour - links[link, TIME] - h
             if s > last:
-                disturbed = True
                 continue
-            if links[link, BOX] & busy:
-                s, g = first_start(links, table, pool, around, p, link, 0, tau, last)
-                if s != tau:
-                    disturbed = True
-                    if s == FAR_FUTURE:
-                        continue
-            n = p + links[link, OFFSET]
+            s, g = undominated_start(links, table, pool, marks, labels, around, task.stamp, p, link, tau, s, last)
+            arrival = s + links[link, TIME]
+            if s < FAR_FUTURE and arrival + h <= bound:
+                successor = label_for(marks, labels, task.stamp, n, g)
+                if successor < 0:
+                    start, end = gap_bounds(table, pool, n, g, task.earliest)
+                    successor = count
+                    add_label(marks, labels, task.stamp, successor, n, g, start, end, h)
+                    labels[successor, G] = FAR_FUTURE
+                    count += 1
+                if arrival < labels[successor, G]:
+                    labels[successor, G] = arrival
+                    labels[successor, PARENT] = label
+                    labels[successor, START] = s
+                    # Where all F up to `landing` count alike, a label can be improved after it was expanded.
+                    labels[successor, CLOSED] = 0
+                    if can_end(labels, successor, task):
+                        bound = arrival
+                    f = max(arrival + h, landing)
+                    size = open_label(heap, size, labels, successor, f, to_go[link, 1], task.earliest)
             if g < table[n, COUNT]:
                 later = pool[table[n, FIRST] + g, EXIT] - links[link, LEAD]
-                if later <= last:
-                    resume = min(resume, later)
-            arrival = s + links[link, TIME]
-            successor = label_for(marks, labels, task.stamp, n, g)
-            if successor < 0:
-                h = heuristic(shape, near, n, task.destination)
-                if arrival + h > bound:
-                    continue
-                start, end = gap_bounds(table, pool, n, g, task.earliest)
-                successor = count
-                add_label(marks, labels, task.stamp, successor, n, g, start, end, h)
-                count += 1
-            elif arrival >= labels[successor, G] or arrival + labels[successor, H] > bound:
-                continue
-            labels[successor, G] = arrival
-            labels[successor, PARENT] = label
-            labels[successor, START] = s
-            if can_end(labels, successor, task):
-                bound = arrival
-            size = open_label(heap, size, labels, successor, task.earliest)
-        h = labels[label, H]
-        if resume < FAR_FUTURE and resume + h <= bound:
-            labels[label, RESUME] = resume
-            size = push(heap, size, labels, heap_key(resume + h - task.earliest, h), ~label)
-    return NO_PATH, count, expansions, True
+                detour = later + links[link, TIME] + h - F
+                if later <= last and detour < NEVER and F + detour <= bound:
+                    pending[label, link] = detour
+                    least = min(least, detour)
+        if least < NEVER and F + least <= bound:
+            size = open_label(heap, size, labels, label, max(F + least, landing), labels[label, H], task.earliest)
+    return NO_PATH, count, expansions
 
 
 @kernel
-def greedy(open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, task: Task) -> tuple[int, int, int, bool]:
+def greedy(open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, task: Task) -> tuple[int, int, int]:
     """CFA* as the paper's Algorithm 3: one label a block, the smallest hovering at the previous block, or a detour.
 
-    Returns as `safe_interval` does.
+    H is the lattice distance, as in the paper. Returns as `safe_interval` does.
     """
     shape, links, near = motion
     table, pool, _ = slabs
-    marks, labels, heap, around = ws
-    if open_departures(shape, near, table, pool, marks, labels, task) == 0:
-        return NO_DEPARTURE_SLOT, -1, 0, True
+    marks, labels, _, around, _, heap, _, _ = ws
+    h = heuristic(shape, near, task.origin, task.destination)
+    if open_departures(h, table, pool, marks, labels, task) == 0:
+        return NO_DEPARTURE_SLOT, -1, 0
     # The first departure slot only: the paper has one label a block.
     marks[task.origin, HEAD] = 0
     labels[0, FOLLOWING] = -1
     count = 1
-    disturbed = labels[0, START] != task.earliest
-    size = open_label(heap, 0, labels, 0, task.earliest)
+    size = open_label(heap, 0, labels, 0, labels[0, G] + h, h, task.earliest)
     expansions = 0
     while size > 0:
-        min_F = pop(heap, size, labels)
-        size -= 1
+        min_F = heap[0, ITEM]
+        size = pop(heap, size)
         if labels[min_F, CLOSED]:
             continue
         labels[min_F, CLOSED] = 1
         if labels[min_F, BLOCK] == task.destination:
-            return FOUND, min_F, expansions, disturbed
+            return FOUND, min_F, expansions
         expansions += 1
         if count + 26 > labels.shape[0] or size + 27 > heap.shape[0]:
-            return WORKSPACE_FULL, -1, expansions, disturbed
+            return WORKSPACE_FULL, -1, expansions
         p = labels[min_F, BLOCK]
         tau = labels[min_F, G]
-        busy = look_around(open_links, links, table, pool, around, p, tau, shape.reach)
+        for link in range(26):
+            around[link] = -1
         for link in range(26):
             if not (open_links[p] >> link) & 1:
                 continue
@@ -193,19 +270,10 @@ def greedy(open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, ta
             if node >= 0 and labels[node, CLOSED]:
                 continue
             last = min(labels[min_F, GAP_END] - 1 - links[link, TAIL], tau + task.hover_limit)
-            s, g = tau, around[link]
-            if s > last:
-                disturbed = True
-                continue
             stay = task.dwell if n == task.destination else 0
-            if links[link, BOX] & busy or stay > 0:
-                s, g = first_start(links, table, pool, around, p, link, stay, tau, last)
-                if s != tau:
-                    disturbed = True
-                    if s == FAR_FUTURE:
-                        continue
+            s, g = first_start(links, table, pool, around, p, link, stay, tau, tau, last)
             arrival = s + links[link, TIME]
-            if node >= 0 and arrival >= labels[node, G]:
+            if s == FAR_FUTURE or (node >= 0 and arrival >= labels[node, G]):
                 continue
             start, end = gap_bounds(table, pool, n, g, task.earliest)
             if node < 0:
@@ -219,5 +287,5 @@ def greedy(open_links: IntArray, motion: Motion, slabs: Slabs, ws: Workspace, ta
             labels[node, G] = arrival
             labels[node, PARENT] = min_F
             labels[node, START] = s
-            size = open_label(heap, size, labels, node, task.earliest)
-    return NO_PATH, count, expansions, True
+            size = open_label(heap, size, labels, node, arrival + labels[node, H], labels[node, H], task.earliest)
+    return NO_PATH, count, expansions

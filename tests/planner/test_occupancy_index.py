@@ -30,7 +30,7 @@ def contents(index: OccupancyIndex) -> list[Held]:
     table, pool, _ = index.slabs
     found = []
     for block in range(len(table)):
-        first, count, _ = table[block]
+        first, count = table[block, : intervals.SIZE_CLASS]
         found += [Held(block, *(int(part) for part in pool[slot])) for slot in range(first, first + count)]
     return found
 

@@ -199,7 +199,7 @@ def test_a_plans_figures_follow_from_its_trajectory(search: Search, situation: S
 @pytest.mark.parametrize("search", Search)
 @given(situation=situations())
 @unhurried
-def test_without_traffic_both_searches_are_a_star_with_the_same_order_among_equals(
+def test_without_traffic_both_searches_are_a_star_and_greedy_orders_equals_as_the_paper_does(
     search: Search, situation: Situation
 ) -> None:
     airspace, request = situation.airspace, situation.request
@@ -209,7 +209,8 @@ def test_without_traffic_both_searches_are_a_star_with_the_same_order_among_equa
     else:
         assert plan.flight_time_ms == flight_time_without_traffic(airspace, request)
         assert plan.delay_ms == plan.ground_hold_ms == plan.hover_ms == 0
-        assert trajectory_of(plan) == greedy_path(airspace, (), request, hover_limit_ms=0)
+        if search is Search.GREEDY:
+            assert trajectory_of(plan) == greedy_path(airspace, (), request, hover_limit_ms=0)
 
 
 @pytest.mark.parametrize("search", Search)
