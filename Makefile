@@ -2,6 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+PEERS := $(VENV)/.peers
 
 .DEFAULT_GOAL := help
 .PHONY: help install serve test bench lint lock openapi
@@ -24,8 +25,13 @@ serve: $(INSTALLED)  ## Run the service on http://127.0.0.1:8000
 test: $(INSTALLED)  ## Run the tests
 	$(BIN)/pytest
 
-bench: $(INSTALLED)  ## Time the planner on 300 to 3,000 flights
-	$(BIN)/python -m tests.benchmark.bench
+# Without their dependencies, which are locked already or not needed to run: so the environment stays the tested one.
+$(PEERS): $(INSTALLED) tests/benchmark/requirements.lock
+	@$(BIN)/pip install --disable-pip-version-check --quiet --require-hashes --no-deps -r tests/benchmark/requirements.lock \
+		&& touch $@ || echo "bench: the peers could not be installed (one needs a C++ compiler), so they are left out"
+
+bench: $(INSTALLED) $(PEERS)  ## Time the planner; choose with PARTS="intents committed city peers"
+	$(BIN)/python -m tests.benchmark.bench $(PARTS)
 
 lint: $(INSTALLED)  ## Check style, types, layers and the container files
 	$(BIN)/ruff check
@@ -35,8 +41,11 @@ lint: $(INSTALLED)  ## Check style, types, layers and the container files
 	$(BIN)/hadolint docker/Dockerfile
 	$(BIN)/yamllint --strict docker
 
-lock:  ## Renew requirements.lock (needs uv)
+lock:  ## Renew requirements.lock and the benchmark's (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --upgrade --group dev pyproject.toml -o requirements.lock
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --upgrade --group bench \
+		--constraint requirements.lock --no-emit-package cython --no-emit-package numpy --no-emit-package setuptools \
+		-o tests/benchmark/requirements.lock
 
 openapi: $(INSTALLED)  ## Write openapi/airmatrix.json anew
 	$(BIN)/airmatrix openapi --out openapi/airmatrix.json

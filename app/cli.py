@@ -17,8 +17,10 @@ from pydantic import ValidationError
 from app import auth, logs, service
 from app.client import ClientError
 from app.commands.airspace import airspace_app
+from app.commands.experiment import experiment_app
 from app.commands.plan import plan
 from app.commands.simulate import simulate
+from app.commands.size_blocks import size_blocks
 from app.commands.terminal import remark, write
 from app.commands.verify import verify
 from app.errors import LedgerMissing, RequestError, StartupError
@@ -40,8 +42,10 @@ cli = typer.Typer(
 db_app = typer.Typer(help="Look after the ledger.", no_args_is_help=True)
 cli.add_typer(airspace_app, name="airspace")
 cli.add_typer(db_app, name="db")
+cli.add_typer(experiment_app, name="experiment")
 cli.command()(plan)
 cli.command()(simulate)
+cli.command()(size_blocks)
 cli.command()(verify)
 
 

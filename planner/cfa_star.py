@@ -4,8 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+import numpy as np
+
 from planner.aircraft import AircraftType
-from planner.airmatrix import AirMatrix
+from planner.airmatrix import AirMatrix, IntArray
 from planner.airspace import Airspace
 from planner.errors import (
     DestinationBlocked,
@@ -20,6 +22,7 @@ from planner.errors import (
 from planner.kernels import labels as label_columns
 from planner.kernels import path as path_kernels
 from planner.kernels import search as search_kernels
+from planner.kernels.balancing import least_cost
 from planner.kernels.connectivity import label_components
 from planner.kernels.endurance import within_endurance
 from planner.kernels.labels import LAST_STAMP, Task, larger_workspace, new_workspace
@@ -59,17 +62,24 @@ class Performance:
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
-    """From block to block (flat indices) with a departure in [earliest, latest], in ms."""
+    """From block to block (flat indices) with a departure in [earliest, latest], in ms.
+
+    `layer_surcharge_ms` (layers,): what each link that ends in a layer counts beyond the time it takes, so that flights
+    prefer other layers; empty, the default, for nothing. Only the safe-interval search knows it.
+    """
 
     origin: int
     destination: int
     performance: Performance
     earliest_departure_ms: int
     latest_departure_ms: int
+    layer_surcharge_ms: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.latest_departure_ms < self.earliest_departure_ms:
             raise ValueError("latest_departure_ms lies before earliest_departure_ms")
+        if any(surcharge < 0 for surcharge in self.layer_surcharge_ms):
+            raise ValueError("a surcharge must not be negative")
 
 
 class Planner:
@@ -93,11 +103,16 @@ class Planner:
 
         Raises
         ------
+        ValueError
+            The request has surcharges, and the search is greedy or the layers are of another number.
         NotPlannable
             No traffic could make it possible (paper 2.1: a block outside, blocked, or cut off).
         NoPlan
             The present reservations leave no plan.
         """
+        layers = self.airspace.grid.dimensions[2]
+        if request.layer_surcharge_ms and (self.search is Search.GREEDY or len(request.layer_surcharge_ms) != layers):
+            raise ValueError(f"surcharges need the safe-interval search and one value for each of {layers} layers")
         self.check(request.origin, request.destination)
         motion = self._motion(request.performance)
         bounds, expansions = self._bounds(motion, request.origin, request.destination)
@@ -147,6 +162,9 @@ class Planner:
         )
         if self.search is Search.GREEDY:
             status, label, further = self._run(search_kernels.greedy, motion, task)
+        elif request.layer_surcharge_ms:
+            surcharge = np.array(request.layer_surcharge_ms, dtype=np.int64)
+            status, label, further = self._run(least_cost, motion, task, bounds, surcharge)
         else:
             status, label, further = self._run(search_kernels.safe_interval, motion, task, bounds)
         expansions += further
@@ -201,7 +219,7 @@ class Planner:
         kernel: Callable[..., tuple[int, int, int]],
         motion: Motion,
         task: Task,
-        *rest: Bounds | int,
+        *rest: Bounds | IntArray | int,
     ) -> tuple[int, int, int]:
         """Run a search kernel, with a larger workspace as often as it asks for one."""
         while True:

@@ -20,16 +20,17 @@ def warm_up() -> None:
     airspace = Airspace("warm-up", "warm-up", grid, 2.0, np.zeros(grid.block_count, dtype=np.bool_))
     times = LinkTimes(np.full(26, 2, dtype=np.int64), 2, 2, 2, 2, 2)
     # One ms less than the flight takes: the search within the endurance runs too, and finds nothing.
-    for performance, search in (
-        (Performance(times), Search.GREEDY),
-        (Performance(times, endurance_ms=3), Search.SAFE_INTERVAL),
+    for performance, search, surcharge in (
+        (Performance(times), Search.GREEDY, ()),
+        (Performance(times, endurance_ms=3), Search.SAFE_INTERVAL, ()),
+        (Performance(times), Search.SAFE_INTERVAL, (0, 0)),
     ):
         planner = Planner(airspace, search)
         block, enter, leave = (np.array([value], dtype=np.int64) for value in (4, 0, 1))
         planner.index.reserve(block, enter, leave, owner=1)
         planner.index.release(block, enter, leave)
         planner.index.forget_before(0)
-        request = PlanRequest(0, grid.block_count - 1, performance, 0, 0)
+        request = PlanRequest(0, grid.block_count - 1, performance, 0, 0, surcharge)
         with suppress(EnduranceExceeded):
             planner.plan(request)
         planner.unconstrained(request)

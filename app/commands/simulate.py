@@ -3,9 +3,7 @@
 import math
 import time
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
@@ -17,22 +15,11 @@ from app.commands.terminal import progress_bar, remark, show
 from app.errors import StartupError
 from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody
 from app.times import format_time, now_ms, parse_time
-from planner.airmatrix import AirMatrix, IntArray
-from planner.airspace import BoolArray
-
-# The paper's table of aircraft; the others that a service offers do not take part.
-PAPER_AIRCRAFT = ("dji-mavic-air", "self-built-drone", "dji-phantom-4", "dji-matrice-600-pro")
-
+from planner.airmatrix import AirMatrix
+from planner.experiments.traffic import PAPER_AIRCRAFT, Flight, Od, random_flights, terminals
 
 _LONGEST_WINDOW_S = 366 * 86_400.0
 _INTERRUPTED = 130
-
-
-class Od(StrEnum):
-    """Where flights begin and end: anywhere free, as in the paper, or on the ground, as real pads lie."""
-
-    UNIFORM = "uniform"
-    LOWEST = "lowest"
 
 
 @dataclass
@@ -73,13 +60,13 @@ def simulate(
             raise StartupError("the airspace has fewer than two free blocks to fly between")
         aircraft = [item.id for item in client.aircraft_types()]
         aircraft = [id_ for id_ in PAPER_AIRCRAFT if id_ in aircraft] or aircraft
-        bodies = random_flights(grid, places, aircraft, flights, start_ms, window, seed, operator)
+        wishes = random_flights(places, aircraft, flights, window, seed)
         began = time.perf_counter()
         interrupted = False
         try:
             with progress_bar("flight intents", flights) as advance_to:
-                for number, body in enumerate(bodies, start=1):
-                    _submit(client, body, tally)
+                for number, wish in enumerate(wishes, start=1):
+                    _submit(client, _body(grid, wish, start_ms, operator, f"seed {seed}, flight {number}"), tally)
                     advance_to(number)
         except KeyboardInterrupt:
             interrupted = True
@@ -92,46 +79,23 @@ def simulate(
         raise typer.Exit(_INTERRUPTED)
 
 
-def terminals(grid: AirMatrix, occupied: BoolArray, od: Od) -> IntArray:
-    """Return the blocks where flights may begin and end."""
-    if od is Od.UNIFORM:
-        return np.flatnonzero(~occupied)
-    columns = grid.dimensions[0] * grid.dimensions[1]
-    free = ~occupied.reshape(-1, columns)
-    lowest: IntArray = np.argmax(free, axis=0) * columns + np.arange(columns)
-    return lowest[free.any(axis=0)]
-
-
-def random_flights(
-    grid: AirMatrix,
-    places: IntArray,
-    aircraft: list[str],
-    flights: int,
-    start_ms: int,
-    window_s: float,
-    seed: int,
-    operator: str,
-) -> Iterator[FlightIntentBody]:
-    """Yield flights in filing order: endpoints, aircraft and departures uniform, all from one seed."""
-    random = np.random.default_rng(seed)
-    for number in range(flights):
-        ends = random.choice(places, size=2, replace=False)
-        x, y, alt_m = grid.centres(ends).T
-        lon, lat = grid.unproject(x, y)
-        origin, destination = (
-            {"lon": float(lon[end]), "lat": float(lat[end]), "alt_m": float(alt_m[end])} for end in (0, 1)
-        )
-        departure_ms = start_ms + int(random.uniform(0, window_s * 1000))
-        yield FlightIntentBody.model_validate(
-            {
-                "operator": operator,
-                "reference": f"seed {seed}, flight {number + 1}",
-                "aircraft_type": aircraft[int(random.integers(len(aircraft)))],
-                "origin": origin,
-                "destination": destination,
-                "earliest_departure": format_time(departure_ms),
-            }
-        )
+def _body(grid: AirMatrix, flight: Flight, start_ms: int, operator: str, reference: str) -> FlightIntentBody:
+    """Return the request for a flight between the centres of its blocks."""
+    x, y, alt_m = grid.centres(np.array([flight.origin, flight.destination])).T
+    lon, lat = grid.unproject(x, y)
+    origin, destination = (
+        {"lon": float(lon[end]), "lat": float(lat[end]), "alt_m": float(alt_m[end])} for end in (0, 1)
+    )
+    return FlightIntentBody.model_validate(
+        {
+            "operator": operator,
+            "reference": reference,
+            "aircraft_type": flight.aircraft,
+            "origin": origin,
+            "destination": destination,
+            "earliest_departure": format_time(start_ms + flight.departure_ms),
+        }
+    )
 
 
 def _submit(client: Client, body: FlightIntentBody, tally: Tally) -> None:

@@ -15,6 +15,7 @@ from planner.kernels.policy import kernel
 
 # Columns of `Workspace.labels`, a row a label.
 G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, CLOSED, QUEUED, DEPARTURE, FLOWN = range(13)
+SURCHARGE = FLOWN
 LABEL_COLUMNS = 13
 
 # Columns of `Workspace.marks`, a row a block: the search that last touched it, and its first label there.
@@ -41,9 +42,9 @@ class Workspace(NamedTuple):
 
     `labels` (n, 13) by the columns above: G, H, block, gap number and bounds, parent label, the start of the link from
     it, the block's `following` label, `closed`, the key it is `queued` under, `departure` and `flown` (see
-    `within_endurance`). `pending` (n, 26): by how much the next arrival by each link would exceed F. Of the
-    neighbours of the block expanded, `around` (26,): the gap; `to_go` (26, 2): H, and the rank among equal F.
-    `field` (blocks, 4) and `far_heap` serve `planner.kernels.static_search`.
+    `within_endurance`) or `surcharge` (see `least_cost`). `pending` (n, 26): by how much the next arrival by each link
+    would exceed F. Of the neighbours of the block expanded, `around` (26,): the gap; `to_go` (26, 2): H, and the rank
+    among equal F. `field` (blocks, 4) and `far_heap` serve `planner.kernels.static_search`.
     """
 
     marks: Int32Array

@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 
 from app.client import Client
-from app.commands.simulate import Od, terminals
 from app.flight_intents import State
 from app.routes.flight_intents import FlightIntentAnswer
 from app.times import format_time, now_ms
-from planner.errors import Block
 from tests.cli.conftest import Outcome, Run, numbers
 from tests.cli.serving import AIRMATRIX, Server, environment
 from tests.cli.town import OCCUPIED, place
-from tests.planner.drawing import drawn
 
 START_MS = now_ms() + 7_200_000
 START = format_time(START_MS)
@@ -97,15 +94,6 @@ def test_lowest_flights_begin_and_end_in_the_lowest_free_block_of_a_column(airma
     above: dict[tuple[int, int], int] = {(4, 4): 2, (0, 9): 1}
     assert all(k == above.get((i, j), 0) for i, j, k in ends)
     assert len(ends) > 40
-
-
-@pytest.mark.parametrize(
-    ("od", "expected"),
-    [(Od.UNIFORM, [(1, 0, 0), (1, 0, 2), (2, 0, 2)]), (Od.LOWEST, [(1, 0, 0), (2, 0, 2)])],
-)
-def test_terminals_are_all_free_blocks_or_the_lowest_of_each_column(od: Od, expected: list[Block]) -> None:
-    airspace = drawn("#.#", "###", "#..").airspace
-    assert [airspace.grid.block(index) for index in terminals(airspace.grid, airspace.occupied, od)] == expected
 
 
 def test_the_summary_says_what_the_service_recorded(airmatrix: Run, town: Server) -> None:

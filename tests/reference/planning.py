@@ -59,6 +59,12 @@ def earliest_arrival(airspace: Airspace, reservations: Iterable[Hold], request: 
     )
 
 
+def least_cost(airspace: Airspace, reservations: Iterable[Hold], request: PlanRequest) -> int | None:
+    """Return the least arrival in ms plus surcharges of the layers flown into; None if there is no trajectory."""
+    traffic = _Traffic(airspace, reservations, request)
+    return traffic.least_cost(traffic.departures())
+
+
 def can_depart(airspace: Airspace, reservations: Iterable[Hold], request: PlanRequest) -> bool:
     """Tell whether the first block is ever free in the departure window, for the dwell if there is one."""
     return bool(_Traffic(airspace, reservations, request).departures())
@@ -139,6 +145,26 @@ class _Traffic:
             if not standing:
                 return None
         return None
+
+    def least_cost(self, departures: Sequence[int]) -> int | None:
+        """Search all (block, tick) in the order of ticks, with the least paid so far to stand in each."""
+        blocks_a_layer = len(self.links) // len(self.request.layer_surcharge_ms)
+        standing: dict[int, dict[int, int]] = defaultdict(dict)
+        for departure in departures:
+            standing[departure + self.dwell_ms][self.request.origin] = 0
+        costs = []
+        for tick in range(min(standing, default=0), self.horizon + 1):
+            for p, paid in standing.pop(tick, {}).items():
+                if p == self.request.destination and self.is_free(p, tick, tick + self.dwell_ms):
+                    costs.append(tick + self.dwell_ms + paid)
+                if self.is_free(p, tick + 1, tick + 1):
+                    standing[tick + 1][p] = min(paid, standing[tick + 1].get(p, paid))
+                for link in self.links[p]:
+                    if self.is_link_free(p, link, tick):
+                        there = standing[tick + link.ms]
+                        then = paid + self.request.layer_surcharge_ms[link.to // blocks_a_layer]
+                        there[link.to] = min(then, there.get(link.to, then))
+        return min(costs, default=None)
 
 
 def _links(airspace: Airspace, times: LinkTimes) -> list[list[_Link]]:

@@ -1,0 +1,464 @@
+"""The paper's section 4 as a study: traffic is planned under each rule and search, judged, and summed up.
+
+Everything but computing times follows from the airspace and the design. Flights are planned in filing order, each
+against all before it, from time 0 on. Each may be held on the ground for as long as the service allows by default; the
+paper says nothing of flights whose first block is taken.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from planner.aircraft import AircraftType, shipped_aircraft_types
+from planner.airmatrix import FloatArray, IntArray
+from planner.airspace import Airspace, OccupancyRule
+from planner.cfa_star import Performance, Planner, PlanRequest, Search
+from planner.errors import NoPlan, NotPlannable, PlannerError
+from planner.experiments import cases, paper
+from planner.experiments.metrics import CornerCuts, Encounter, conflicts_added, corner_cuts, encounter, seconds_in_use
+from planner.experiments.traffic import PAPER_AIRCRAFT, Demand, Flight, Od, random_flights, terminals
+from planner.path import Plan
+from planner.separation import Approach, CheckedFlight, Kind, verify
+
+GROUND_HOLD_MS = 300_000
+HOVER_LIMIT_MS = 60_000
+
+
+class NothingToStudy(PlannerError):
+    """The airspace leaves no flights to study."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """How much is simulated.
+
+    Traffic is `flights` within `windows_min` for each of `seeds`, of which the first within the paper's window is the
+    reference; `sizes` flights within the paper's window compare searches and rules. Computing times are medians of
+    `timings` passes.
+    """
+
+    flights: int
+    seeds: tuple[int, ...]
+    sizes: tuple[int, ...]
+    timings: int
+    windows_min: tuple[int, ...] = paper.WINDOWS_MIN
+
+    @classmethod
+    def of(cls, flights: int, seeds: int, first_seed: int, quick: bool = False) -> "Design":
+        """Return the whole design, or the quick one: three seeds at most, one size, each time measured once."""
+        sizes = (flights,) if quick else (flights, round(flights * 10 / 3), flights * 10)
+        count = min(seeds, 3) if quick else seeds
+        return cls(flights, tuple(range(first_seed, first_seed + count)), sizes, timings=1 if quick else 5)
+
+    @property
+    def workload(self) -> int:
+        """How many flights are planned in all."""
+        reference = 4 * (self.timings + 1) + len(_types_compared())
+        density = 3 * len(self.windows_min) * len(self.seeds)
+        return self.flights * (reference + density) + sum(self.sizes) * len(Od) * len(OccupancyRule) * len(Search)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Flights planned one after another.
+
+    `plans` and `refusals` have one entry a flight, one of both None. `seconds` (flights,) is how long each took from
+    request to plan and into the index.
+    """
+
+    rule: OccupancyRule
+    flights: tuple[Flight, ...]
+    plans: tuple[Plan | None, ...]
+    refusals: tuple[str | None, ...]
+    seconds: FloatArray
+
+    @property
+    def accepted(self) -> list[Plan]:
+        """The plans that were found."""
+        return [plan for plan in self.plans if plan is not None]
+
+    @property
+    def refused(self) -> Counter[str]:
+        """How many flights were refused for which reason."""
+        return Counter(refusal for refusal in self.refusals if refusal is not None)
+
+    @property
+    def delay_s(self) -> FloatArray:
+        """Delays of the flights, NaN where there is no plan: (flights,)."""
+        return np.array([np.nan if plan is None else plan.delay_ms / 1000 for plan in self.plans])
+
+    @property
+    def unconstrained_s(self) -> FloatArray:
+        """Flight times without traffic under the run's rule, NaN where there is no plan: (flights,)."""
+        return np.array([np.nan if plan is None else plan.unconstrained_ms / 1000 for plan in self.plans])
+
+    @property
+    def expansions(self) -> int:
+        """Blocks expanded in all."""
+        return sum(plan.expansions for plan in self.accepted)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the independent checker says of a run.
+
+    `too_near` are the pairs of flight numbers that come nearer than a block side horizontally and a block height
+    vertically at one instant, of `pairs` in the air at the same time; `near_buildings` counts pairs of a flight and a
+    building nearer than half a block side, `violations` all that the airspace's rule forbids but pairs of flights.
+    `closest` is the nearest horizontally while within a block height.
+    """
+
+    pairs: int
+    too_near: tuple[tuple[int, int], ...]
+    near_buildings: int
+    violations: int
+    closest: Approach | None
+    clearance_m: float | None
+
+
+@dataclass(frozen=True)
+class NearMiss:
+    """Two flights (their numbers) that come too near."""
+
+    flights: tuple[int, int]
+    encounter: Encounter
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The paper's scenario once: A* and both searches under the midpoint rule, and safe-interval under containment.
+
+    `conflicts` (flights,) is what each A* trajectory adds to the paper's metric, `whole_second_conflicts` the same with
+    occupations widened to whole seconds, and `conflicts_left` the metric over the trajectories of greedy CFA*.
+    `comparisons` has the flights that both A* and greedy CFA* planned. `near_misses` are those of the greedy run, the
+    least separated first.
+    """
+
+    astar: Run
+    greedy: Run
+    safe_interval: Run
+    containment: Run
+    conflicts: IntArray
+    whole_second_conflicts: IntArray
+    conflicts_left: int
+    comparisons: tuple[cases.Comparison, ...]
+    greedy_verdict: Verdict
+    containment_verdict: Verdict
+    near_misses: tuple[NearMiss, ...]
+    corner_cuts: CornerCuts
+    in_use_s: FloatArray
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One seed's traffic within one window: A* and greedy CFA* by midpoint, safe-interval CFA* by containment."""
+
+    window_min: int
+    seed: int
+    conflicts: int
+    whole_second_conflicts: int
+    delay_s: float
+    refused: int
+    too_near: int
+    corner_cuts: CornerCuts
+    containment_delay_s: float
+    containment_refused: int
+    containment_too_near: int
+    violations: int
+
+
+@dataclass(frozen=True, eq=False)
+class UseByType:
+    """The reference traffic, all of one type of aircraft, by greedy CFA*: seconds for which each block is held."""
+
+    aircraft: AircraftType
+    refused: int
+    in_use_s: FloatArray
+
+    @property
+    def speed_ratio(self) -> float:
+        """The ratio of horizontal to vertical speed."""
+        return self.aircraft.max_horizontal_speed_mps / self.aircraft.max_vertical_speed_mps
+
+
+@dataclass(frozen=True)
+class Trade:
+    """One rule and search on one size of traffic. `delay_s` is the sum over flights that were not refused."""
+
+    od: Od
+    flights: int
+    rule: OccupancyRule
+    search: Search
+    accepted: int
+    refused: Counter[str]
+    delay_s: float
+    longest_delay_s: float
+    computing_s: float
+    expansions: int
+    verdict: Verdict
+
+    @property
+    def mean_delay_s(self) -> float:
+        """Delay a flight that was not refused."""
+        return self.delay_s / self.accepted if self.accepted else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """All that was measured."""
+
+    airspace: Airspace
+    design: Design
+    reference: Reference
+    trials: tuple[Trial, ...]
+    use_by_type: tuple[UseByType, ...]
+    trades: tuple[Trade, ...]
+
+
+def conduct(airspace: Airspace, design: Design, on_progress: Callable[[int], None] | None = None) -> Study:
+    """Run the whole study; `on_progress` is told how many flights of the `workload` have been planned.
+
+    The airspace's own rule and terminal dwell do not count: the paper has no dwell.
+
+    Raises
+    ------
+    NothingToStudy
+        There are fewer than two columns with a free block, or buildings part the ends of every flight of the reference.
+    AircraftProfileError
+    """
+    simulator = Simulator(airspace, on_progress)
+    reference = simulate_reference(simulator, design)
+    return Study(
+        airspace,
+        design,
+        reference,
+        trials=tuple(
+            simulate_trial(simulator, design.flights, window_min, seed)
+            for window_min in design.windows_min
+            for seed in design.seeds
+        ),
+        use_by_type=use_by_type(simulator, reference.astar.flights),
+        trades=tuple(
+            trade(simulator, Demand(od, flights, paper.WINDOW_MIN, design.seeds[0]), rule, search)
+            for od in Od
+            for flights in design.sizes
+            for rule in OccupancyRule
+            for search in Search
+        ),
+    )
+
+
+class Simulator:
+    """Plans traffic in one airspace under any rule, and counts the flights."""
+
+    def __init__(self, airspace: Airspace, on_progress: Callable[[int], None] | None = None) -> None:
+        self.airspaces = {rule: replace(airspace, rule=rule, terminal_dwell_ms=0) for rule in OccupancyRule}
+        self.types = {aircraft.id: aircraft for aircraft in shipped_aircraft_types()}
+        self.performances = {id_: Performance.of(aircraft, airspace.grid) for id_, aircraft in self.types.items()}
+        self._terminals = {od: terminals(airspace.grid, airspace.occupied, od) for od in Od}
+        self._planners: dict[tuple[OccupancyRule, Search], Planner] = {}
+        self._planned = 0
+        self._on_progress = on_progress
+        if len(self._terminals[Od.LOWEST]) < 2:
+            raise NothingToStudy("the airspace has fewer than two columns of blocks to fly between")
+
+    def flights(self, demand: Demand) -> tuple[Flight, ...]:
+        """Draw flights of the paper's four types of aircraft."""
+        places = self._terminals[demand.od]
+        return tuple(random_flights(places, PAPER_AIRCRAFT, demand.flights, 60.0 * demand.window_min, demand.seed))
+
+    def fly(self, flights: Sequence[Flight], rule: OccupancyRule, search: Search) -> Run:
+        """Plan flights by CFA*, each against all before it."""
+        return self._fly(flights, rule, search, reserves=True)
+
+    def fly_astar(self, flights: Sequence[Flight], rule: OccupancyRule) -> Run:
+        """Plan flights by A*, each as if it were alone."""
+        return self._fly(flights, rule, Search.GREEDY, reserves=False)
+
+    def _fly(self, flights: Sequence[Flight], rule: OccupancyRule, search: Search, reserves: bool) -> Run:
+        if (rule, search) not in self._planners:
+            self._planners[rule, search] = Planner(self.airspaces[rule], search, HOVER_LIMIT_MS)
+        planner = self._planners[rule, search]
+        planner.index.clear()
+        plans: list[Plan | None] = []
+        refusals: list[str | None] = []
+        seconds = []
+        for number, flight in enumerate(flights):
+            plan, refusal = None, None
+            request = PlanRequest(
+                flight.origin,
+                flight.destination,
+                self.performances[flight.aircraft],
+                flight.departure_ms,
+                flight.departure_ms + GROUND_HOLD_MS,
+            )
+            began = time.perf_counter()
+            try:
+                plan = planner.plan(request)
+                if reserves:
+                    planner.index.reserve(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms, number)
+            except (NoPlan, NotPlannable) as error:
+                refusal = error.reason
+            seconds.append(time.perf_counter() - began)
+            plans.append(plan)
+            refusals.append(refusal)
+            self._planned += 1
+            if self._on_progress is not None:
+                self._on_progress(self._planned)
+        return Run(rule, tuple(flights), tuple(plans), tuple(refusals), np.array(seconds))
+
+    def judge(self, run: Run) -> Verdict:
+        """Have the independent checker judge a run."""
+        report = verify(
+            self.airspaces[run.rule],
+            [
+                CheckedFlight(
+                    str(number),
+                    plan.block,
+                    plan.arrive_ms,
+                    plan.depart_ms,
+                    plan.hold_block,
+                    plan.hold_enter_ms,
+                    plan.hold_exit_ms,
+                )
+                for number, plan in enumerate(run.plans)
+                if plan is not None
+            ],
+        )
+        findings = (*report.near_misses, *report.violations)
+        near = [finding for finding in findings if finding.kind is Kind.TOO_NEAR]
+        return Verdict(
+            pairs=report.flight_pairs,
+            too_near=tuple((int(first), int(second)) for first, second in (finding.flights for finding in near)),
+            near_buildings=sum(finding.kind is Kind.BUILDING for finding in findings),
+            violations=sum(violation.kind is not Kind.TOO_NEAR for violation in report.violations),
+            closest=report.closest,
+            clearance_m=None if report.clearance is None else report.clearance.distance_m,
+        )
+
+
+def simulate_reference(simulator: Simulator, design: Design) -> Reference:
+    """Simulate the paper's scenario with the design's first seed."""
+    flights = simulator.flights(Demand(Od.UNIFORM, design.flights, paper.WINDOW_MIN, design.seeds[0]))
+    midpoint = OccupancyRule.MIDPOINT
+    astar = _timed(design.timings, lambda: simulator.fly_astar(flights, midpoint))
+    if not astar.accepted:
+        raise NothingToStudy(f"buildings part the ends of all {len(flights)} flights of the paper's scenario")
+    greedy = _timed(design.timings, lambda: simulator.fly(flights, midpoint, Search.GREEDY))
+    safe_interval = _timed(design.timings, lambda: simulator.fly(flights, midpoint, Search.SAFE_INTERVAL))
+    containment = _timed(
+        design.timings, lambda: simulator.fly(flights, OccupancyRule.CONTAINMENT, Search.SAFE_INTERVAL)
+    )
+    verdict = simulator.judge(greedy)
+    airspace = simulator.airspaces[midpoint]
+    return Reference(
+        astar=astar,
+        greedy=greedy,
+        safe_interval=safe_interval,
+        containment=containment,
+        conflicts=_conflicts(astar),
+        whole_second_conflicts=_conflicts(astar, in_whole_seconds=True),
+        conflicts_left=int(conflicts_added(greedy.accepted).sum()),
+        comparisons=tuple(
+            cases.compare(airspace.grid, number, alone, among)
+            for number, (alone, among) in enumerate(zip(astar.plans, greedy.plans, strict=True))
+            if alone is not None and among is not None
+        ),
+        greedy_verdict=verdict,
+        containment_verdict=simulator.judge(containment),
+        near_misses=near_misses(greedy, verdict, airspace),
+        corner_cuts=corner_cuts(airspace, greedy.accepted),
+        in_use_s=seconds_in_use(greedy.accepted, airspace.grid.block_count),
+    )
+
+
+def _conflicts(run: Run, *, in_whole_seconds: bool = False) -> IntArray:
+    """Return what each flight of a run adds to the conflict metric, nothing where it was refused: (flights,)."""
+    added = np.zeros(len(run.plans), dtype=np.int64)
+    planned = [plan is not None for plan in run.plans]
+    added[planned] = conflicts_added(run.accepted, in_whole_seconds=in_whole_seconds)
+    return added
+
+
+def near_misses(run: Run, verdict: Verdict, airspace: Airspace) -> tuple[NearMiss, ...]:
+    """Return when and how near each pair that came too near was, the least separated first."""
+    found = []
+    for pair in verdict.too_near:
+        first, second = (run.plans[number] for number in pair)
+        if first is not None and second is not None and (met := encounter(airspace.grid, first, second)) is not None:
+            found.append(NearMiss(pair, met))
+    return tuple(sorted(found, key=lambda miss: (miss.encounter.separation, miss.flights)))
+
+
+def simulate_trial(simulator: Simulator, flights: int, window_min: int, seed: int) -> Trial:
+    """Simulate one seed's traffic within one window."""
+    drawn = simulator.flights(Demand(Od.UNIFORM, flights, window_min, seed))
+    midpoint = OccupancyRule.MIDPOINT
+    astar = simulator.fly_astar(drawn, midpoint)
+    greedy = simulator.fly(drawn, midpoint, Search.GREEDY)
+    containment = simulator.fly(drawn, OccupancyRule.CONTAINMENT, Search.SAFE_INTERVAL)
+    verdict, containment_verdict = simulator.judge(greedy), simulator.judge(containment)
+    return Trial(
+        window_min=window_min,
+        seed=seed,
+        conflicts=int(_conflicts(astar).sum()),
+        whole_second_conflicts=int(_conflicts(astar, in_whole_seconds=True).sum()),
+        delay_s=_sum(greedy.delay_s),
+        refused=greedy.refused.total(),
+        too_near=len(verdict.too_near),
+        corner_cuts=corner_cuts(simulator.airspaces[midpoint], greedy.accepted),
+        containment_delay_s=_sum(containment.delay_s),
+        containment_refused=containment.refused.total(),
+        containment_too_near=len(containment_verdict.too_near),
+        violations=verdict.violations + containment_verdict.violations,
+    )
+
+
+def use_by_type(simulator: Simulator, flights: Iterable[Flight]) -> tuple[UseByType, ...]:
+    """Simulate the same flights with one type of aircraft each: the paper's three, then the other shipped ones."""
+    flights = tuple(flights)
+    uses = []
+    for id_ in _types_compared():
+        run = simulator.fly(
+            [replace(flight, aircraft=id_) for flight in flights], OccupancyRule.MIDPOINT, Search.GREEDY
+        )
+        in_use_s = seconds_in_use(run.accepted, simulator.airspaces[run.rule].grid.block_count)
+        uses.append(UseByType(simulator.types[id_], run.refused.total(), in_use_s))
+    return tuple(uses)
+
+
+def trade(simulator: Simulator, demand: Demand, rule: OccupancyRule, search: Search) -> Trade:
+    """Simulate one demand under one rule and search."""
+    run = simulator.fly(simulator.flights(demand), rule, search)
+    return Trade(
+        od=demand.od,
+        flights=demand.flights,
+        rule=rule,
+        search=search,
+        accepted=len(run.accepted),
+        refused=run.refused,
+        delay_s=_sum(run.delay_s),
+        longest_delay_s=float(np.nanmax(run.delay_s)) if run.accepted else 0.0,
+        computing_s=float(run.seconds.sum()),
+        expansions=run.expansions,
+        verdict=simulator.judge(run),
+    )
+
+
+def _types_compared() -> tuple[str, ...]:
+    others = [aircraft.id for aircraft in shipped_aircraft_types() if aircraft.id not in paper.USE_BY_TYPE]
+    return (*paper.USE_BY_TYPE, *others)
+
+
+def _timed(passes: int, fly: Callable[[], Run]) -> Run:
+    """Return a run with each flight's median time of several passes, after one that does not count."""
+    fly()
+    runs = [fly() for _ in range(passes)]
+    return replace(runs[0], seconds=np.median([run.seconds for run in runs], axis=0))
+
+
+def _sum(seconds: FloatArray) -> float:
+    return float(np.nansum(seconds))
