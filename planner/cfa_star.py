@@ -26,7 +26,7 @@ from planner.kernels.balancing import least_cost
 from planner.kernels.connectivity import label_components
 from planner.kernels.endurance import within_endurance
 from planner.kernels.labels import LAST_STAMP, Task, larger_workspace, new_workspace
-from planner.kernels.motion import Motion
+from planner.kernels.motion import VISITS, Motion
 from planner.kernels.static_search import Bounds, static_search
 from planner.links import LinkTimes, build_link_times, build_offsets
 from planner.occupancy import OccupancyIndex, build_motion, open_links
@@ -170,11 +170,14 @@ class Planner:
         expansions += further
         if status == search_kernels.NO_DEPARTURE_SLOT:
             owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
-            return NoDepartureSlot("the first block is reserved throughout the departure window", owners)
+            return NoDepartureSlot(
+                "the first block is reserved throughout the departure window", owners, expansions=expansions
+            )
         if status == search_kernels.NO_PATH:
             return NoConflictFreePath(
                 "no conflict-free path leads from the first block within the departure window",
                 self._owners_around(label),
+                expansions=expansions,
             )
         plan = self._plan(motion, task, bounds, label, expansions)
         endurance = request.performance.endurance_ms
@@ -182,10 +185,12 @@ class Planner:
             return plan
         if self.search is Search.SAFE_INTERVAL:
             status, label, further = self._run(within_endurance, motion, task, bounds, endurance)
+            expansions += further
             if status == search_kernels.FOUND:
-                return self._plan(motion, task, bounds, label, expansions + further)
+                return self._plan(motion, task, bounds, label, expansions)
         return EnduranceExceeded(
-            f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s"
+            f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s",
+            expansions=expansions,
         )
 
     def _earliest_feasible_departure(self, request: PlanRequest, motion: Motion, bounds: Bounds) -> int | None:
@@ -240,6 +245,7 @@ class Planner:
     def _plan(self, motion: Motion, task: Task, bounds: Bounds, goal: int, expansions: int) -> Plan:
         """Turn the labels of a finished search into a plan."""
         ws = self._workspace
+        visits = int(ws.around[VISITS])
         block, arrive, depart, gap_end = path_kernels.trace(ws.labels, goal, task)
         slot_opens_ms = int(arrive[0])
         if self.search is Search.SAFE_INTERVAL:
@@ -260,6 +266,7 @@ class Planner:
             unconstrained_ms=bounds.optimum + 2 * task.dwell,
             terminal_dwell_ms=task.dwell,
             expansions=expansions,
+            interval_visits=visits,
         )
 
     def _motion(self, performance: Performance) -> Motion:

@@ -83,7 +83,7 @@ class NoPlan(PlannerError):
     """The traffic leaves no plan for this request.
 
     `conflicting_owners` are the owners of the reservations in the way and `earliest_feasible_departure_ms` a
-    departure that would work, where known.
+    departure that would work, where known. `expansions` is what it took to find out.
     """
 
     reason: ClassVar[str]
@@ -93,9 +93,11 @@ class NoPlan(PlannerError):
         message: str,
         conflicting_owners: tuple[int, ...] = (),
         earliest_feasible_departure_ms: int | None = None,
+        expansions: int = 0,
     ) -> None:
         super().__init__(message)
         self.conflicting_owners = conflicting_owners
+        self.expansions = expansions
         self.earliest_feasible_departure_ms = earliest_feasible_departure_ms
 
 

@@ -43,8 +43,9 @@ class Workspace(NamedTuple):
     `labels` (n, 13) by the columns above: G, H, block, gap number and bounds, parent label, the start of the link from
     it, the block's `following` label, `closed`, the key it is `queued` under, `departure` and `flown` (see
     `within_endurance`) or `surcharge` (see `least_cost`). `pending` (n, 26): by how much the next arrival by each link
-    would exceed F. Of the neighbours of the block expanded, `around` (26,): the gap; `to_go` (26, 2): H, and the rank
-    among equal F. `field` (blocks, 4) and `far_heap` serve `planner.kernels.static_search`.
+    would exceed F. Of the neighbours of the block expanded, `around` (27,): the gap, and last how many reservations and
+    gaps a search has looked at; `to_go` (26, 2): H, and the rank among equal F. `field` (blocks, 4) and `far_heap`
+    serve `planner.kernels.static_search`.
     """
 
     marks: Int32Array
@@ -63,7 +64,7 @@ def new_workspace(block_count: int, label_count: int) -> Workspace:
         marks=np.zeros((block_count, 2), dtype=np.int32),
         labels=np.empty((label_count, LABEL_COLUMNS), dtype=np.int64),
         pending=np.empty((label_count, 26), dtype=np.int32),
-        around=np.zeros(26, dtype=np.int64),
+        around=np.zeros(27, dtype=np.int64),
         to_go=np.zeros((26, 2), dtype=np.int64),
         heap=np.empty((4 * label_count, HEAP_COLUMNS), dtype=np.int64),
         far_heap=np.empty((4 * label_count, HEAP_COLUMNS), dtype=np.int64),

@@ -19,6 +19,9 @@ MOST_SIDES = 6
 
 STEPS = np.array(DIRECTIONS, dtype=np.int64)
 
+# Where `Workspace.around` counts what a search has looked at of reservations: growth that no clock shows.
+VISITS = 26
+
 
 class Shape(NamedTuple):
     """Numbers about the grid and the aircraft: block counts, lattice steps beyond `near` (ms)."""
@@ -76,6 +79,7 @@ def gap_around(table: Int32Array, pool: IntArray, around: IntArray, link: int, b
     if g < 0:
         g = ended_by(table, pool, block, time)
         around[link] = g
+        around[VISITS] += 1
     return g
 
 
@@ -109,24 +113,26 @@ def first_start(
             return FAR_FUTURE, g
         if g < count and pool[first + g, ENTER] < s + duration + stay:
             g += 1
+            around[VISITS] += 1
             continue
         free_from = s
         for place in range(SIDE, SIDE + links[link, SIDES]):
             side = links[link, place]
             block = p + links[side, OFFSET]
             at_tau = gap_around(table, pool, around, side, block, tau)
-            free_from = wait_for(table, pool, block, at_tau, free_from, duration)
+            free_from = wait_for(table, pool, around, block, at_tau, free_from, duration)
         if free_from == s:
             return s, g
         s = free_from
 
 
 @kernel
-def wait_for(table: Int32Array, pool: IntArray, block: int, g: int, s: int, duration: int) -> int:
+def wait_for(table: Int32Array, pool: IntArray, around: IntArray, block: int, g: int, s: int, duration: int) -> int:
     """Return s or, if a block is reserved within `duration` of it, when it is free that long; look from gap g on."""
     first = table[block, FIRST]
     for slot in range(first + g, first + table[block, COUNT]):
         if pool[slot, ENTER] >= s + duration:
             break
+        around[VISITS] += 1
         s = max(s, pool[slot, EXIT])
     return s

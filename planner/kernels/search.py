@@ -30,6 +30,7 @@ from planner.kernels.motion import (
     STEPS,
     TAIL,
     TIME,
+    VISITS,
     Motion,
     coordinates,
     first_start,
@@ -115,6 +116,7 @@ def undominated_start(
     g = gap_around(table, pool, around, link, n, tau)
     while g < table[n, COUNT] and pool[first + g, EXIT] - lead <= earliest:
         g += 1
+        around[VISITS] += 1
     s = earliest
     if g > 0:
         s = max(s, pool[first + g - 1, EXIT] - lead)
@@ -139,6 +141,7 @@ def safe_interval(
     shape, links, near = motion
     table, pool, _ = slabs
     marks, labels, pending, around, to_go, heap, _, field = ws
+    around[VISITS] = 0
     i, j, k = bounds.start
     h, rank = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
     count = open_departures(h, table, pool, marks, labels, task)
@@ -238,6 +241,7 @@ def greedy(open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, 
     shape, links, near = motion
     table, pool, _ = slabs
     marks, labels, _, around, _, heap, _, _ = ws
+    around[VISITS] = 0
     h = heuristic(shape, near, task.origin, task.destination)
     if open_departures(h, table, pool, marks, labels, task) == 0:
         return NO_DEPARTURE_SLOT, -1, 0

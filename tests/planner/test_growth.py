@@ -1,0 +1,130 @@
+"""How the search's work grows, counted in expansions and interval visits, never in seconds."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import pytest
+
+from planner.airspace import Airspace, OccupancyRule
+from planner.cfa_star import Planner, PlanRequest
+from planner.errors import NoConflictFreePath
+from planner.path import Plan
+from tests.planner.drawing import airspace_of
+from tests.planner.traffic import flight, planner_in, reserve
+from tests.reference.planning import Hold, link_times
+
+HOUR_MS = 3_600_000
+TIMES = link_times(horizontal=1000, diagonal=1414, vertical=4000, alpha=4200, beta=4400)
+SIDE, LAYERS = 30, 2
+
+
+def district(side: int = SIDE) -> Airspace:
+    """A square of towers on every third block of the lower layer."""
+    layers = np.zeros((LAYERS, side, side), dtype=np.bool_)
+    layers[0, 1::3, 1::3] = True
+    return airspace_of((side, side, LAYERS), layers.ravel(), rule=OccupancyRule.CONTAINMENT, terminal_dwell_ms=0)
+
+
+def open_air(count_i: int, count_j: int, count_k: int) -> Airspace:
+    """Blocks without any building."""
+    nothing = np.zeros(count_i * count_j * count_k, dtype=np.bool_)
+    return airspace_of((count_i, count_j, count_k), nothing, rule=OccupancyRule.CONTAINMENT, terminal_dwell_ms=0)
+
+
+def random_flights(airspace: Airspace, hour: int, count: int) -> Iterator[PlanRequest]:
+    """Yield the same flights, up to the hour in which they go, whichever hour it is."""
+    random = np.random.default_rng(1)
+    free = np.flatnonzero(~airspace.occupied)
+    for _ in range(count):
+        origin, destination = random.choice(free, 2, replace=False).tolist()
+        start = hour * HOUR_MS + int(random.integers(HOUR_MS))
+        yield flight(origin, destination, earliest=start, latest=start + 300_000, times=TIMES)
+
+
+def commit(planner: Planner, requests: Iterable[PlanRequest]) -> None:
+    for request in requests:
+        plan = planner.plan(request)
+        planner.index.reserve(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms, 1)
+
+
+def work(plans: Iterable[Plan]) -> tuple[int, int]:
+    """Return expansions and interval visits in all."""
+    counted = [(plan.expansions, plan.interval_visits) for plan in plans]
+    return sum(expansions for expansions, _ in counted), sum(visits for _, visits in counted)
+
+
+@pytest.mark.compiled
+def test_reservations_at_other_hours_cost_a_plan_nothing() -> None:
+    airspace = district()
+    hour = 4
+    alone, among_others = Planner(airspace), Planner(airspace)
+    commit(alone, random_flights(airspace, hour, 150))
+    for other in range(9):
+        commit(among_others, random_flights(airspace, other, 150))
+    assert len(among_others.index) == 9 * len(alone.index)
+    further = list(random_flights(airspace, hour, 200))[150:]
+    assert work(alone.plan(request) for request in further) == work(among_others.plan(request) for request in further)
+
+
+def test_far_reservations_of_the_blocks_on_the_way_cost_a_plan_nothing() -> None:
+    airspace = open_air(20, 1, 1)
+    empty, booked = planner_in(airspace), planner_in(airspace)
+    for block in range(20):
+        far = (Hold(block, day * 24 * HOUR_MS, day * 24 * HOUR_MS + 1) for day in range(1, 50))
+        reserve(booked, far, owner=1)
+    request = flight(0, 19, times=TIMES)
+    assert booked.plan(request).expansions == empty.plan(request).expansions
+    assert booked.plan(request).interval_visits == empty.plan(request).interval_visits
+
+
+def test_with_room_a_flight_takes_expansions_in_proportion_to_its_length() -> None:
+    def expansions(side: int) -> int:
+        return Planner(open_air(side, side, 3)).plan(flight(0, side * (side - 4) - 1, times=TIMES)).expansions
+
+    lengths = [20, 40, 80]
+    assert [expansions(side) <= 3 * side for side in lengths] == [True] * 3
+
+
+def test_a_detour_that_shows_only_at_the_destination_is_not_paid_for_all_the_way() -> None:
+    """A roofed yard around the destination: the lattice distance is too short by the same everywhere outside."""
+
+    def expansions(side: int) -> int:
+        layers = np.zeros((LAYERS, side, side), dtype=np.bool_)
+        yard = layers[0, -9:-2, -9:-2]
+        yard[:] = True
+        yard[1:-1, 1:-1] = False
+        yard[-1, 3] = False
+        layers[1, -9:-2, -9:-2] = True
+        airspace = airspace_of(
+            (side, side, LAYERS), layers.ravel(), rule=OccupancyRule.CONTAINMENT, terminal_dwell_ms=0
+        )
+        destination = (side - 6) * side + side - 6
+        return Planner(airspace).plan(flight(0, destination, times=TIMES)).expansions
+
+    # Four times the way, sixteen times the area.
+    assert expansions(160) <= 6 * expansions(40)
+
+
+def test_a_destination_reserved_for_an_hour_costs_a_few_expansions_not_the_whole_district() -> None:
+    airspace = district()
+    destination = airspace.grid.index((SIDE - 1, SIDE - 1, 0))
+    request = flight(0, destination, times=TIMES)
+    free = planner_in(airspace).plan(request)
+    waiting = planner_in(airspace, [Hold(destination, 0, HOUR_MS)]).plan(request)
+    assert waiting.arrival_ms >= HOUR_MS
+    assert waiting.expansions <= 3 * free.expansions
+
+
+def test_proof_that_there_is_no_path_is_as_short_as_what_shuts_the_flight_in() -> None:
+    """All around the origin is reserved until its own free interval is over."""
+    airspace = district()
+    grid = airspace.grid
+    origin, destination = grid.index((0, 0, 0)), grid.index((SIDE - 1, SIDE - 1, 1))
+    corner = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 1)]
+    shut = [Hold(grid.index(block), 0, 10_000) for block in corner]
+    planner = planner_in(airspace, [*shut, Hold(origin, 9_000, 20_000)])
+    with pytest.raises(NoConflictFreePath) as refusal:
+        planner.plan(flight(origin, destination, times=TIMES))
+    with_path = planner.plan(flight(origin, destination, latest=30_000, times=TIMES))
+    assert with_path.departure_ms == 20_000
+    assert refusal.value.expansions <= with_path.expansions
