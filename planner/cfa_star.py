@@ -95,7 +95,7 @@ class Planner:
         self._components = label_components(self._open_links, self._offsets)
         # Memory that no search touches costs nothing.
         self._workspace = new_workspace(airspace.grid.block_count, max(_FEWEST_LABELS, airspace.grid.block_count // 8))
-        self._stamp = 0
+        self._stamp = self._static_stamp = 0
         self._motions: dict[tuple[int, ...], Motion] = {}
 
     def plan(self, request: PlanRequest) -> Plan:
@@ -115,8 +115,8 @@ class Planner:
             raise ValueError(f"surcharges need the safe-interval search and one value for each of {layers} layers")
         self.check(request.origin, request.destination)
         motion = self._motion(request.performance)
-        bounds, expansions = self._bounds(motion, request.origin, request.destination)
-        found = self._search(request, motion, bounds, expansions)
+        bounds = self._bounds(motion, request.origin, request.destination)
+        found = self._search(request, motion, bounds)
         if isinstance(found, Plan):
             return found
         found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request, motion, bounds)
@@ -125,7 +125,7 @@ class Planner:
     def unconstrained(self, request: PlanRequest) -> int:
         """Return the flight time without traffic in ms, dwell included: A* under the airspace's rule."""
         self.check(request.origin, request.destination)
-        bounds, _ = self._bounds(self._motion(request.performance), request.origin, request.destination)
+        bounds = self._bounds(self._motion(request.performance), request.origin, request.destination)
         return bounds.optimum + 2 * self.airspace.terminal_dwell_ms
 
     def check(self, origin: int, destination: int) -> None:
@@ -139,17 +139,17 @@ class Planner:
         if self._components[origin] != self._components[destination]:
             raise Disconnected("buildings leave no way from the origin's block to the destination's")
 
-    def _bounds(self, motion: Motion, origin: int, destination: int) -> tuple[Bounds, int]:
-        """Search without traffic; return what the search with it needs, and the expansions."""
+    def _bounds(self, motion: Motion, origin: int, destination: int) -> Bounds:
+        """Search without traffic; return what the search with it needs."""
         while True:
-            sufficed, bounds, expansions = static_search(
-                self._open_links, motion, self._workspace, origin, destination, self._next_stamp()
+            sufficed, bounds = static_search(
+                self._open_links, motion, self._workspace, origin, destination, self._next_static_stamp()
             )
             if sufficed:
-                return bounds, expansions
+                return bounds
             self._workspace = larger_workspace(self._workspace)
 
-    def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds, expansions: int = 0) -> Plan | NoPlan:
+    def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds) -> Plan | NoPlan:
         """Search and return the plan, or the error that says why there is none."""
         task = Task(
             request.origin,
@@ -167,7 +167,7 @@ class Planner:
             status, label, further = self._run(least_cost, motion, task, bounds, surcharge)
         else:
             status, label, further = self._run(search_kernels.safe_interval, motion, task, bounds)
-        expansions += further
+        expansions = bounds.expansions + further
         if status == search_kernels.NO_DEPARTURE_SLOT:
             owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
             return NoDepartureSlot(
@@ -237,10 +237,17 @@ class Planner:
     def _next_stamp(self) -> int:
         if self._stamp == LAST_STAMP:
             self._workspace.marks[:] = 0
-            self._workspace.field[:] = 0
             self._stamp = 0
         self._stamp += 1
         return self._stamp
+
+    def _next_static_stamp(self) -> int:
+        """Count by itself: what a static search leaves must outlive the stamps of the searches that use it."""
+        if self._static_stamp == LAST_STAMP:
+            self._workspace.field[:] = 0
+            self._static_stamp = 0
+        self._static_stamp += 1
+        return self._static_stamp
 
     def _plan(self, motion: Motion, task: Task, bounds: Bounds, goal: int, expansions: int) -> Plan:
         """Turn the labels of a finished search into a plan."""
@@ -266,6 +273,7 @@ class Planner:
             unconstrained_ms=bounds.optimum + 2 * task.dwell,
             terminal_dwell_ms=task.dwell,
             expansions=expansions,
+            static_expansions=bounds.expansions,
             interval_visits=visits,
         )
 

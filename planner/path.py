@@ -46,8 +46,8 @@ class Plan(Trajectory):
 
     `hold_*` (m,): half-open holds [enter, exit), overlapping ones of a block merged, sorted by enter, then i, j, k.
     `slot_opens_ms` is the first moment, from the earliest departure on, of the free interval of the first block in
-    which the flight departs. `expansions` counts those without traffic too; `interval_visits` the reservations and free
-    intervals that the search with traffic looked at.
+    which the flight departs. `expansions` counts both searches', `static_expansions` those of the one without
+    traffic; `interval_visits` the reservations and free intervals that the one with traffic looked at.
     """
 
     hold_block: IntArray
@@ -56,6 +56,7 @@ class Plan(Trajectory):
     earliest_departure_ms: int
     slot_opens_ms: int
     expansions: int
+    static_expansions: int
     interval_visits: int
 
     @property

@@ -23,22 +23,23 @@ _NEVER = FAR_FUTURE >> 1
 
 
 class Bounds(NamedTuple):
-    """What a static search leaves: its ends' blocks (i, j, k), the optimum C and the least open b in ms, its stamp."""
+    """What a static search leaves: its ends (i, j, k), the optimum C and the least open b in ms, and its stamp."""
 
     start: tuple[int, int, int]
     end: tuple[int, int, int]
     optimum: int
     least: int
     stamp: int
+    expansions: int
 
 
 @kernel
 def static_search(
     open_links: Int32Array, motion: Motion, ws: Workspace, origin: int, destination: int, stamp: int
-) -> tuple[bool, Bounds, int]:
+) -> tuple[bool, Bounds]:
     """Search from both ends until C is proved, and settle the times to go along all static optima found.
 
-    There must be a path. Returns whether the workspace sufficed, the bounds, and how many expansions it took.
+    There must be a path. Returns whether the workspace sufficed, and the bounds.
     """
     shape, links, near = motion
     _, _, _, _, _, heap_O, heap_D, field = ws
@@ -61,7 +62,7 @@ def static_search(
         if b_O + b_D >= 2 * C:
             break
         if size_O + 27 > heap_O.shape[0] or size_D + 27 > heap_D.shape[0]:
-            return False, Bounds(start, end, C, b_D, stamp), from_O + from_D
+            return False, Bounds(start, end, C, b_D, stamp, from_O + from_D)
         forwards = 2 * from_O < from_D
         if forwards:
             mark, time, other = FROM_MARK, FROM, TO_MARK
@@ -98,7 +99,7 @@ def static_search(
             else:
                 size_D = push(heap_D, size_D, heap_key(2 * reached + to_O - to_D, to_O), n, n)
     settle(open_links, links, field, heap_O, heap_D, size_D, C, stamp)
-    return True, Bounds(start, end, C, b_D, stamp), from_O + from_D
+    return True, Bounds(start, end, C, b_D, stamp, from_O + from_D)
 
 
 @kernel

@@ -17,7 +17,7 @@ from planner.cfa_star import Planner, PlanRequest
 from planner.errors import NoPlan
 from planner.path import Plan
 
-_WIDTH = 170
+_WIDTH = 180
 _STEPS = 100
 
 Arguments = ParamSpec("Arguments")
@@ -30,6 +30,7 @@ class Run:
 
     seconds: list[float] = field(default_factory=list)
     expansions: int = 0
+    static_expansions: int = 0
     delay_ms: int = 0
     refused: int = 0
 
@@ -41,6 +42,7 @@ class Run:
             self.refused += 1
             return None
         self.expansions += plan.expansions
+        self.static_expansions += plan.static_expansions
         self.delay_ms += plan.delay_ms
         return plan
 

@@ -17,7 +17,7 @@ def plan(blocks: list[Block], delay_ms: int = 0, link_ms: int = 1000) -> Plan:
     block = np.array([GRID.index(block) for block in blocks])
     times = delay_ms + link_ms * np.arange(len(blocks))
     none = np.empty(0, dtype=np.int64)
-    return Plan(block, times, times, link_ms * (len(blocks) - 1), 0, none, none, none, 0, 0, 0, 0)
+    return Plan(block, times, times, link_ms * (len(blocks) - 1), 0, none, none, none, 0, 0, 0, 0, 0)
 
 
 def comparison(cfa_star: list[Block], delay_ms: int = 0, number: int = 0) -> Comparison:

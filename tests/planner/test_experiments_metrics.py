@@ -30,7 +30,7 @@ def plan_holding(*holds: Hold) -> Plan:
     """Return a plan of which only the holds (block, enter, exit) matter."""
     block, enter_ms, exit_ms = np.array(holds, dtype=np.int64).reshape(-1, 3).T
     nowhere = np.zeros(1, dtype=np.int64)
-    return Plan(nowhere, nowhere, nowhere, 0, 0, block, enter_ms, exit_ms, 0, 0, 0, 0)
+    return Plan(nowhere, nowhere, nowhere, 0, 0, block, enter_ms, exit_ms, 0, 0, 0, 0, 0)
 
 
 def flight(*stops: tuple[Block, int, int], grid: AirMatrix = GRID) -> Trajectory:
