@@ -16,7 +16,7 @@ from starlette.responses import Response
 from app import errors
 from app.flight_intents import FlightIntent, Refusal
 from app.times import format_time
-from planner.errors import NoPlan, NotPlannable
+from planner.errors import AircraftProfileError, NoPlan, NotPlannable
 
 log = structlog.get_logger()
 
@@ -41,6 +41,9 @@ KINDS: dict[type[Exception], Kind] = {
     NoPlan: Kind(
         "no-conflict-free-plan", 409, "The present traffic leaves no plan",
         "Submit again with a later departure; `earliest_feasible_departure` is one that works now, where known.",
+    ),
+    AircraftProfileError: Kind(
+        "aircraft-too-slow", 422, "The aircraft is too slow for this airspace", "Choose a faster aircraft type."
     ),
     errors.UnknownAircraftType: Kind(
         "unknown-aircraft-type", 422, "Unknown aircraft type", "Choose one from /v1/aircraft-types."

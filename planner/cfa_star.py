@@ -10,6 +10,7 @@ from planner.aircraft import AircraftType
 from planner.airmatrix import AirMatrix, IntArray
 from planner.airspace import Airspace
 from planner.errors import (
+    AircraftProfileError,
     DestinationBlocked,
     Disconnected,
     EnduranceExceeded,
@@ -27,7 +28,7 @@ from planner.kernels.connectivity import label_components
 from planner.kernels.endurance import within_endurance
 from planner.kernels.labels import LAST_STAMP, Task, larger_workspace, new_workspace
 from planner.kernels.motion import VISITS, Motion
-from planner.kernels.static_search import Bounds, static_search
+from planner.kernels.static_search import UNREACHED, Bounds, static_search
 from planner.links import LinkTimes, build_link_times, build_offsets
 from planner.occupancy import OccupancyIndex, build_motion, open_links
 from planner.path import Plan
@@ -35,6 +36,8 @@ from planner.path import Plan
 # How far beyond the requested window a refusal looks for a departure that would work; within what keys can order.
 _OUTLOOK_MS = 1 << 31
 _FEWEST_LABELS = 1 << 14
+# A minute for each link is more than any balance asks for, and the sum stays within what keys can order.
+MAX_SURCHARGE_MS = 60_000
 # A refusal names the flights around as many labels at most: a flight that is shut in has few.
 _SHUT_IN_LABELS = 100
 
@@ -78,8 +81,8 @@ class PlanRequest:
     def __post_init__(self) -> None:
         if self.latest_departure_ms < self.earliest_departure_ms:
             raise ValueError("latest_departure_ms lies before earliest_departure_ms")
-        if any(surcharge < 0 for surcharge in self.layer_surcharge_ms):
-            raise ValueError("a surcharge must not be negative")
+        if any(not 0 <= surcharge <= MAX_SURCHARGE_MS for surcharge in self.layer_surcharge_ms):
+            raise ValueError(f"a surcharge must lie between 0 and {MAX_SURCHARGE_MS} ms")
 
 
 class Planner:
@@ -145,6 +148,8 @@ class Planner:
             sufficed, bounds = static_search(
                 self._open_links, motion, self._workspace, origin, destination, self._next_static_stamp()
             )
+            if sufficed and bounds.optimum >= UNREACHED:
+                raise AircraftProfileError("too slow: the way there takes longer than the search can order")
             if sufficed:
                 return bounds
             self._workspace = larger_workspace(self._workspace)

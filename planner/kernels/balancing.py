@@ -23,7 +23,7 @@ from planner.kernels.labels import (
     can_end,
     gap_bounds,
 )
-from planner.kernels.motion import LEAD, OFFSET, STEPS, TAIL, TIME, Motion, coordinates, first_start
+from planner.kernels.motion import LEAD, OFFSET, STEPS, TAIL, TIME, VISITS, Motion, coordinates, first_start
 from planner.kernels.policy import kernel
 from planner.kernels.search import FOUND, NO_DEPARTURE_SLOT, NO_PATH, WORKSPACE_FULL, open_departures, open_label
 from planner.kernels.static_search import Bounds, time_to_go
@@ -60,15 +60,18 @@ def least_cost(
     shape, links, near = motion
     table, pool, _ = slabs
     marks, labels, _, around, _, heap, _, field = ws
+    around[VISITS] = 0
     i, j, k = bounds.start
     h, rank = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
-    count = open_departures(h, table, pool, marks, labels, task)
+    count = open_departures(h, rank, table, pool, marks, labels, task)
     if count == 0:
         return NO_DEPARTURE_SLOT, -1, 0
+    if count == labels.shape[0]:
+        return WORKSPACE_FULL, -1, 0
     size = 0
     for label in range(count):
         labels[label, SURCHARGE] = 0
-        size = open_label(heap, size, labels, label, labels[label, G] + h, rank, task.earliest)
+        size = open_label(heap, size, labels, label, labels[label, G] + h, task.earliest)
     expansions = 0
     while size > 0:
         label = heap[0, ITEM]
@@ -98,12 +101,12 @@ def least_cost(
                     if count == labels.shape[0] or size == heap.shape[0]:
                         return WORKSPACE_FULL, -1, expansions
                     start, end = gap_bounds(table, pool, n, g, task.earliest)
-                    add_label(marks, labels, task.stamp, count, n, g, start, end, h)
+                    add_label(marks, labels, task.stamp, count, n, g, start, end, h, rank)
                     labels[count, G] = arrival
                     labels[count, SURCHARGE] = surcharge
                     labels[count, PARENT] = label
                     labels[count, START] = s
-                    size = open_label(heap, size, labels, count, arrival + surcharge + h, rank, task.earliest)
+                    size = open_label(heap, size, labels, count, arrival + surcharge + h, task.earliest)
                     count += 1
                 if g == table[n, COUNT]:
                     break

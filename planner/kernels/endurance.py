@@ -81,13 +81,15 @@ def within_endurance(
     table, pool, _ = slabs
     marks, labels, _, around, _, heap, _, field = ws
     i, j, k = bounds.start
-    h, _ = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
-    count = open_departures(h, table, pool, marks, labels, task)
+    h, rank = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
+    count = open_departures(h, rank, table, pool, marks, labels, task)
+    if count == labels.shape[0]:
+        return WORKSPACE_FULL, -1, 0
     size = 0
     for label in range(count):
         labels[label, DEPARTURE] = min(task.latest, labels[label, GAP_END] - 1 - task.dwell)
         labels[label, FLOWN] = task.dwell
-        size = open_label(heap, size, labels, label, labels[label, G] + h, h, task.earliest)
+        size = open_label(heap, size, labels, label, labels[label, G] + h, task.earliest)
     expansions = 0
     while size > 0:
         label = heap[0, ITEM]
@@ -105,7 +107,7 @@ def within_endurance(
             last = labels[label, GAP_END] - 1 - links[link, TAIL]
             n = p + links[link, OFFSET]
             x, y, z = i + STEPS[link, 0], j + STEPS[link, 1], k + STEPS[link, 2]
-            h, _ = time_to_go(field, shape, near, bounds, n, x, y, z)
+            h, rank = time_to_go(field, shape, near, bounds, n, x, y, z)
             in_air = endurance - task.dwell - h
             flown = labels[label, FLOWN] + links[link, TIME]
             tau = labels[label, G]
@@ -122,13 +124,13 @@ def within_endurance(
                     if count == labels.shape[0] or size == heap.shape[0]:
                         return WORKSPACE_FULL, -1, expansions
                     start, end = gap_bounds(table, pool, n, g, task.earliest)
-                    add_label(marks, labels, task.stamp, count, n, g, start, end, h)
+                    add_label(marks, labels, task.stamp, count, n, g, start, end, h, rank)
                     labels[count, G] = arrival
                     labels[count, DEPARTURE] = departure
                     labels[count, FLOWN] = flown
                     labels[count, PARENT] = label
                     labels[count, START] = s
-                    size = open_label(heap, size, labels, count, arrival + h, h, task.earliest)
+                    size = open_label(heap, size, labels, count, arrival + h, task.earliest)
                     count += 1
                 tau = until + 1
     return NO_PATH, count, expansions

@@ -1,15 +1,15 @@
 """Open lists: 4-ary heaps of (key, tie, item), in the one order that makes planning deterministic.
 
-Keys pack F, then whether the time to go is only a bound, then H, which among equal F is larger G. Ties are broken by
-block index, then by the start of the free interval: by what a label is, never by where it happens to be stored.
+Keys pack F and a rank among equal F: H, which is larger G first, or what `time_to_go` says. Ties are broken by block
+index, then by the start of the free interval: by what a label is, never by where it happens to be stored.
 """
 
 from planner.airmatrix import IntArray
 from planner.kernels.policy import kernel
 
-# 6 days of H, 49 of F; 33 million blocks, 8 years of free intervals.
-MAX_H = (1 << 29) - 1
-RANK_BITS = 30
+# 37 hours of H, 198 days of F; 33 million blocks, 8 years of free intervals.
+MAX_H = (1 << 27) - 1
+RANK_BITS = 28
 MAX_F = (1 << (62 - RANK_BITS)) - 1
 TIME_BITS = 38
 

@@ -24,10 +24,11 @@ ENTER, EXIT, OWNER = range(3)
 
 
 class Slabs(NamedTuple):
-    """`table` (blocks, 3): first slot, count, size class. `pool` (slots, 3): enter, exit, owner.
+    """`table` (blocks, 4): first slot, count, size class, `ended_by`'s last answer. `pool` (slots, 3): enter, exit,
+    owner.
 
     `chains` (SIZE_CLASSES + 1,): heads of the chains of freed slabs, -1 for none; last, how many slots were ever
-    handed out. Kernels get the arrays one by one: numba counts references each time it takes one out of a tuple.
+    handed out.
     """
 
     table: Int32Array

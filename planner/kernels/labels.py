@@ -14,12 +14,15 @@ from planner.kernels.intervals import COUNT, ENTER, EXIT, FAR_FUTURE, FIRST
 from planner.kernels.policy import kernel
 
 # Columns of `Workspace.labels`, a row a label.
-G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, CLOSED, QUEUED, DEPARTURE, FLOWN = range(13)
+G, H, BLOCK, GAP, GAP_START, GAP_END, PARENT, START, FOLLOWING, RANK, CLOSED, QUEUED, DEPARTURE, FLOWN = range(14)
 SURCHARGE = FLOWN
-LABEL_COLUMNS = 13
+LABEL_COLUMNS = 14
 
 # Columns of `Workspace.marks`, a row a block: the search that last touched it, and its first label there.
 STAMP, HEAD = range(2)
+
+# What `pending` says of a link that has no arrival left.
+NEVER = (1 << 31) - 1
 
 # The largest stamp: twice as much and one must fit into int32.
 LAST_STAMP = (1 << 30) - 1
@@ -40,12 +43,12 @@ class Task(NamedTuple):
 class Workspace(NamedTuple):
     """Memory that searches share, one at a time; stamps say what belongs to the present search.
 
-    `labels` (n, 13) by the columns above: G, H, block, gap number and bounds, parent label, the start of the link from
-    it, the block's `following` label, `closed`, the key it is `queued` under, `departure` and `flown` (see
-    `within_endurance`) or `surcharge` (see `least_cost`). `pending` (n, 26): by how much the next arrival by each link
-    would exceed F. Of the neighbours of the block expanded, `around` (27,): the gap, and last how many reservations and
-    gaps a search has looked at; `to_go` (26, 2): H, and the rank among equal F. `field` (blocks, 4) and `far_heap`
-    serve `planner.kernels.static_search`.
+    `labels` (n, 14) by the columns above: G, H, block, gap number and bounds, parent label, the start of the link from
+    it, the block's `following` label, its `rank` among equal F, `closed`, the key it is `queued` under, `departure` and
+    `flown` (see `within_endurance`) or `surcharge` (see `least_cost`). `pending` (n, 26): by how many ms the next
+    arrival by each link would exceed the label's own F, NEVER for none left. Of the neighbours of the block expanded,
+    `around` (27,): the gap, and last how many reservations and gaps the search has looked at; `to_go` (26, 2): H and
+    rank. `field` (blocks, 4) and `far_heap` serve `planner.kernels.static_search`.
     """
 
     marks: Int32Array
@@ -73,9 +76,9 @@ def new_workspace(block_count: int, label_count: int) -> Workspace:
 
 
 def larger_workspace(ws: Workspace) -> Workspace:
-    """Return memory for twice as many labels, with the marks that this one holds."""
+    """Return memory for twice as many labels, with the marks and counts that this one holds."""
     larger = new_workspace(0, 2 * len(ws.labels))
-    return larger._replace(marks=ws.marks, field=ws.field)
+    return larger._replace(marks=ws.marks, field=ws.field, around=ws.around)
 
 
 @kernel
@@ -112,6 +115,7 @@ def add_label(
     start: int,
     end: int,
     h: int,
+    rank: int,
 ) -> None:
     """Set up an unused label as the head of its block's list."""
     labels[label, BLOCK] = block
@@ -119,6 +123,7 @@ def add_label(
     labels[label, GAP_START] = start
     labels[label, GAP_END] = end
     labels[label, H] = h
+    labels[label, RANK] = rank
     labels[label, CLOSED] = 0
     labels[label, FOLLOWING] = marks[block, HEAD] if marks[block, STAMP] == stamp else -1
     marks[block, STAMP] = stamp

@@ -1,7 +1,7 @@
 """CFA* (paper 3.2): `greedy` as its Algorithm 3, `safe_interval` beyond it; both are A* where nothing is reserved."""
 
 from planner.airmatrix import Int32Array, IntArray
-from planner.kernels.heap import ITEM, KEY, heap_key, heap_tie, key_f, pop, push
+from planner.kernels.heap import ITEM, KEY, MAX_F, heap_key, heap_tie, key_f, pop, push
 from planner.kernels.intervals import COUNT, EXIT, FAR_FUTURE, FIRST, Slabs, ended_by
 from planner.kernels.labels import (
     BLOCK,
@@ -11,8 +11,10 @@ from planner.kernels.labels import (
     GAP_END,
     GAP_START,
     HEAD,
+    NEVER,
     PARENT,
     QUEUED,
+    RANK,
     STAMP,
     START,
     G,
@@ -45,13 +47,11 @@ FOUND, NO_DEPARTURE_SLOT, NO_PATH, WORKSPACE_FULL = range(4)
 # Arrivals within so many ms of the F under way are made at once, rather than come back for each.
 EAGERNESS = 1000
 
-# What no detour (ms, in int32) reaches: 24 days.
-NEVER = (1 << 31) - 1
-
 
 @kernel
 def open_departures(
     h: int,
+    rank: int,
     table: Int32Array,
     pool: IntArray,
     marks: Int32Array,
@@ -65,7 +65,7 @@ def open_departures(
         if start > task.latest or count == labels.shape[0]:
             break
         if start + task.dwell + 1 <= end:
-            add_label(marks, labels, task.stamp, count, task.origin, gap, start, end, h)
+            add_label(marks, labels, task.stamp, count, task.origin, gap, start, end, h, rank)
             labels[count, G] = start + task.dwell
             labels[count, PARENT] = -1
             labels[count, START] = start
@@ -74,9 +74,9 @@ def open_departures(
 
 
 @kernel
-def open_label(heap: IntArray, size: int, labels: IntArray, label: int, f: int, rank: int, earliest: int) -> int:
+def open_label(heap: IntArray, size: int, labels: IntArray, label: int, f: int, earliest: int) -> int:
     """Queue a label on the OpenList with this F; return the list's new size."""
-    key = heap_key(f - earliest, rank)
+    key = heap_key(f - earliest, labels[label, RANK])
     labels[label, QUEUED] = key
     return push(heap, size, key, heap_tie(labels[label, BLOCK], labels[label, GAP_START] - earliest), label)
 
@@ -87,12 +87,14 @@ def earliest_landing(links: IntArray, table: Int32Array, pool: IntArray, task: T
     entering = FAR_FUTURE
     for link in range(26):
         entering = min(entering, links[link, TIME] - links[link, LEAD])
-    for gap in range(ended_by(table, pool, task.destination, soonest), table[task.destination, COUNT] + 1):
+    gap = ended_by(table, pool, task.destination, soonest)
+    while True:
+        # The last gap has no end.
         start, end = gap_bounds(table, pool, task.destination, gap, task.earliest)
         landing = max(soonest, start + entering)
         if landing + task.dwell + 1 <= end:
             return landing
-    return soonest
+        gap += 1
 
 
 @kernel
@@ -144,13 +146,15 @@ def safe_interval(
     around[VISITS] = 0
     i, j, k = bounds.start
     h, rank = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
-    count = open_departures(h, table, pool, marks, labels, task)
+    count = open_departures(h, rank, table, pool, marks, labels, task)
     if count == 0:
         return NO_DEPARTURE_SLOT, -1, 0
+    if count == labels.shape[0]:
+        return WORKSPACE_FULL, -1, 0
     landing = earliest_landing(links, table, pool, task, labels[0, G] + h)
     size = 0
     for label in range(count):
-        size = open_label(heap, size, labels, label, max(labels[label, G] + h, landing), rank, task.earliest)
+        size = open_label(heap, size, labels, label, max(labels[label, G] + h, landing), task.earliest)
     expansions = 0
     bound = FAR_FUTURE
     f_least = key_f(heap[0, KEY])
@@ -167,7 +171,7 @@ def safe_interval(
         p, G_p, end_p = labels[label, BLOCK], labels[label, G], labels[label, GAP_END]
         F = G_p + labels[label, H]
         f_now = key_f(key)
-        until = task.earliest + f_now + EAGERNESS + ((f_now - f_least) >> 1) - F
+        until = task.earliest + f_now + EAGERNESS + ((f_now - f_least) >> 1) - F if f_now < MAX_F else FAR_FUTURE
         is_new = not labels[label, CLOSED]
         labels[label, CLOSED] = 1
         i, j, k = coordinates(shape, p)
@@ -178,7 +182,7 @@ def safe_interval(
                 if not (open_links[p] >> link) & 1:
                     pending[label, link] = NEVER
                     continue
-            elif pending[label, link] > until:
+            elif pending[label, link] == NEVER or pending[label, link] > until:
                 continue
             x, y, z = i + STEPS[link, 0], j + STEPS[link, 1], k + STEPS[link, 2]
             h, rank = time_to_go(field, shape, near, bounds, p + links[link, OFFSET], x, y, z)
@@ -190,45 +194,49 @@ def safe_interval(
         least = NEVER
         for link in range(26):
             detour = pending[label, link]
+            if detour == NEVER:
+                continue
             if detour > until:
                 least = min(least, detour)
                 continue
             pending[label, link] = NEVER
-            if detour == NEVER:
-                continue
             n, h = p + links[link, OFFSET], to_go[link, 0]
             last = end_p - 1 - links[link, TAIL]
             s = F + detour - links[link, TIME] - h
-            if s > last:
-                continue
-            s, g = undominated_start(links, table, pool, marks, labels, around, task.stamp, p, link, tau, s, last)
-            arrival = s + links[link, TIME]
-            if s < FAR_FUTURE and arrival + h <= bound:
-                successor = label_for(marks, labels, task.stamp, n, g)
-                if successor < 0:
-                    start, end = gap_bounds(table, pool, n, g, task.earliest)
-                    successor = count
-                    add_label(marks, labels, task.stamp, successor, n, g, start, end, h)
-                    labels[successor, G] = FAR_FUTURE
-                    count += 1
-                if arrival < labels[successor, G]:
-                    labels[successor, G] = arrival
-                    labels[successor, PARENT] = label
-                    labels[successor, START] = s
-                    # Where all F up to `landing` count alike, a label can be improved after it was expanded.
-                    labels[successor, CLOSED] = 0
-                    if can_end(labels, successor, task):
-                        bound = arrival
-                    f = max(arrival + h, landing)
-                    size = open_label(heap, size, labels, successor, f, to_go[link, 1], task.earliest)
-            if g < table[n, COUNT]:
-                later = pool[table[n, FIRST] + g, EXIT] - links[link, LEAD]
-                detour = later + links[link, TIME] + h - F
-                if later <= last and detour < NEVER and F + detour <= bound:
-                    pending[label, link] = detour
-                    least = min(least, detour)
+            while s <= last:
+                s, g = undominated_start(links, table, pool, marks, labels, around, task.stamp, p, link, tau, s, last)
+                arrival = s + links[link, TIME]
+                if s < FAR_FUTURE and arrival + h <= bound:
+                    successor = label_for(marks, labels, task.stamp, n, g)
+                    if successor < 0:
+                        start, end = gap_bounds(table, pool, n, g, task.earliest)
+                        successor = count
+                        add_label(marks, labels, task.stamp, successor, n, g, start, end, h, to_go[link, 1])
+                        labels[successor, G] = FAR_FUTURE
+                        count += 1
+                    if arrival < labels[successor, G]:
+                        labels[successor, G] = arrival
+                        labels[successor, PARENT] = label
+                        labels[successor, START] = s
+                        # Where all F up to `landing` count alike, a label can be improved after it was expanded.
+                        labels[successor, CLOSED] = 0
+                        if can_end(labels, successor, task):
+                            bound = arrival
+                        size = open_label(heap, size, labels, successor, max(arrival + h, landing), task.earliest)
+                if g == table[n, COUNT]:
+                    break
+                s = pool[table[n, FIRST] + g, EXIT] - links[link, LEAD]
+                detour = s + links[link, TIME] + h - F
+                if s > last or F + detour > bound:
+                    break
+                # A detour of weeks, which NEVER would hide, is made at once, but only while there is room.
+                is_full = count + 26 > labels.shape[0] or size + 27 > heap.shape[0]
+                if until < detour < NEVER or is_full:
+                    pending[label, link] = min(detour, NEVER - 1)
+                    least = min(least, pending[label, link])
+                    break
         if least < NEVER and F + least <= bound:
-            size = open_label(heap, size, labels, label, max(F + least, landing), labels[label, H], task.earliest)
+            size = open_label(heap, size, labels, label, max(F + least, landing), task.earliest)
     return NO_PATH, count, expansions
 
 
@@ -243,13 +251,13 @@ def greedy(open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, 
     marks, labels, _, around, _, heap, _, _ = ws
     around[VISITS] = 0
     h = heuristic(shape, near, task.origin, task.destination)
-    if open_departures(h, table, pool, marks, labels, task) == 0:
+    if open_departures(h, h, table, pool, marks, labels, task) == 0:
         return NO_DEPARTURE_SLOT, -1, 0
     # The first departure slot only: the paper has one label a block.
     marks[task.origin, HEAD] = 0
     labels[0, FOLLOWING] = -1
     count = 1
-    size = open_label(heap, 0, labels, 0, labels[0, G] + h, h, task.earliest)
+    size = open_label(heap, 0, labels, 0, labels[0, G] + h, task.earliest)
     expansions = 0
     while size > 0:
         min_F = heap[0, ITEM]
@@ -283,7 +291,7 @@ def greedy(open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, 
             if node < 0:
                 node = count
                 h = heuristic(shape, near, n, task.destination)
-                add_label(marks, labels, task.stamp, node, n, g, start, end, h)
+                add_label(marks, labels, task.stamp, node, n, g, start, end, h, h)
                 count += 1
             labels[node, GAP] = g
             labels[node, GAP_START] = start
@@ -291,5 +299,5 @@ def greedy(open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, 
             labels[node, G] = arrival
             labels[node, PARENT] = min_F
             labels[node, START] = s
-            size = open_label(heap, size, labels, node, arrival + labels[node, H], labels[node, H], task.earliest)
+            size = open_label(heap, size, labels, node, arrival + labels[node, H], task.earliest)
     return NO_PATH, count, expansions

@@ -19,7 +19,7 @@ from planner.kernels.policy import kernel
 FROM_MARK, FROM, TO_MARK, TO = range(4)
 
 # More than any b, and twice it still fits into int64.
-_NEVER = FAR_FUTURE >> 1
+UNREACHED = FAR_FUTURE >> 1
 
 
 class Bounds(NamedTuple):
@@ -37,12 +37,13 @@ class Bounds(NamedTuple):
 def static_search(
     open_links: Int32Array, motion: Motion, ws: Workspace, origin: int, destination: int, stamp: int
 ) -> tuple[bool, Bounds]:
-    """Search from both ends until C is proved, and settle the times to go along all static optima found.
+    """Search from both ends until C is proved, and settle the times to go along the static optima found.
 
-    There must be a path. Returns whether the workspace sufficed, and the bounds.
+    Ways from either end of more than MAX_H are not followed; C is UNREACHED if there are no others. Returns whether the
+    workspace sufficed, and the bounds.
     """
     shape, links, near = motion
-    _, _, _, _, _, heap_O, heap_D, field = ws
+    heap_O, heap_D, field = ws.heap, ws.far_heap, ws.field
     start, end = coordinates(shape, origin), coordinates(shape, destination)
     opened, closed = 2 * stamp, 2 * stamp + 1
     h = lattice_time(shape, near, end[0] - start[0], end[1] - start[1], end[2] - start[2])
@@ -50,27 +51,27 @@ def static_search(
     field[destination, TO_MARK], field[destination, TO] = opened, 0
     size_O = push(heap_O, 0, heap_key(h, h), origin, origin)
     size_D = push(heap_D, 0, heap_key(h, h), destination, destination)
-    C = b_O = b_D = _NEVER
+    C = b_O = b_D = UNREACHED
     from_O = from_D = 0
     while True:
         while size_O > 0 and field[heap_O[0, ITEM], FROM_MARK] == closed:
             size_O = pop(heap_O, size_O)
         while size_D > 0 and field[heap_D[0, ITEM], TO_MARK] == closed:
             size_D = pop(heap_D, size_D)
-        b_O = key_f(heap_O[0, KEY]) if size_O > 0 else _NEVER
-        b_D = key_f(heap_D[0, KEY]) if size_D > 0 else _NEVER
+        b_O = key_f(heap_O[0, KEY]) if size_O > 0 else UNREACHED
+        b_D = key_f(heap_D[0, KEY]) if size_D > 0 else UNREACHED
         if b_O + b_D >= 2 * C:
             break
         if size_O + 27 > heap_O.shape[0] or size_D + 27 > heap_D.shape[0]:
-            return False, Bounds(start, end, C, b_D, stamp, from_O + from_D)
-        forwards = 2 * from_O < from_D
+            return False, Bounds(start, end, C, 0, stamp, from_O + from_D)
+        forwards = size_D == 0 or (size_O > 0 and 2 * from_O < from_D)
         if forwards:
-            mark, time, other = FROM_MARK, FROM, TO_MARK
+            mark, time, other_mark, other_time = FROM_MARK, FROM, TO_MARK, TO
             p = heap_O[0, ITEM]
             size_O = pop(heap_O, size_O)
             from_O += 1
         else:
-            mark, time, other = TO_MARK, TO, FROM_MARK
+            mark, time, other_mark, other_time = TO_MARK, TO, FROM_MARK, FROM
             p = heap_D[0, ITEM]
             size_D = pop(heap_D, size_D)
             from_D += 1
@@ -83,23 +84,24 @@ def static_search(
                 continue
             n = p + links[link, OFFSET]
             reached = field[p, time] + links[link, TIME]
-            if field[n, mark] >= opened and field[n, time] <= reached:
+            if reached > MAX_H or (field[n, mark] >= opened and field[n, time] <= reached):
                 continue
-            if field[n, other] >= opened:
-                C = min(C, reached + field[n, other + 1])
+            field[n, mark] = opened
+            field[n, time] = reached
+            if field[n, other_mark] >= opened:
+                C = min(C, reached + field[n, other_time])
             x, y, z = i + STEPS[link, 0], j + STEPS[link, 1], k + STEPS[link, 2]
             to_D = lattice_time(shape, near, end[0] - x, end[1] - y, end[2] - z)
             if forwards and reached + to_D >= C:
                 continue
             to_O = lattice_time(shape, near, start[0] - x, start[1] - y, start[2] - z)
-            field[n, mark] = opened
-            field[n, time] = reached
             if forwards:
                 size_O = push(heap_O, size_O, heap_key(2 * reached + to_D - to_O, to_D), n, n)
             else:
                 size_D = push(heap_D, size_D, heap_key(2 * reached + to_O - to_D, to_O), n, n)
-    settle(open_links, links, field, heap_O, heap_D, size_D, C, stamp)
-    return True, Bounds(start, end, C, b_D, stamp, from_O + from_D)
+    # The origin's heap has served.
+    settled = settle(open_links, links, field, heap_O, heap_D, size_D, C, stamp)
+    return settled, Bounds(start, end, C, min(b_D, MAX_H + 1), stamp, from_O + from_D)
 
 
 @kernel
@@ -112,16 +114,18 @@ def settle(
     size_D: int,
     C: int,
     stamp: int,
-) -> None:
+) -> bool:
     """Follow static optima from where the destination's side stopped back to the origin: there, times to go are final.
 
     Where the times from the origin and to the destination add up to C, both are exact, and so is the time of a
-    predecessor that makes C again.
+    predecessor that makes C again. Returns whether the stack sufficed.
     """
     opened, closed = 2 * stamp, 2 * stamp + 1
     depth = 0
     for place in range(size_D):
         n = heap_D[place, ITEM]
+        if depth == stack.shape[0]:
+            return False
         if field[n, TO_MARK] == opened and field[n, FROM_MARK] >= opened and field[n, FROM] + field[n, TO] == C:
             field[n, TO_MARK] = closed
             stack[depth, ITEM] = n
@@ -129,6 +133,8 @@ def settle(
     while depth > 0:
         depth -= 1
         p = stack[depth, ITEM]
+        if depth + 26 > stack.shape[0]:
+            return False
         for link in range(26):
             if (open_links[p] >> link) & 1:
                 n = p + links[link, OFFSET]
@@ -138,6 +144,7 @@ def settle(
                     field[n, TO] = to_go
                     stack[depth, ITEM] = n
                     depth += 1
+    return True
 
 
 @kernel

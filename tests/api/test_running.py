@@ -18,7 +18,7 @@ from app.errors import RequestError, UnsafeListening
 from app.main import create_app
 from app.routes.events import EventPage
 from app.settings import Settings
-from planner.errors import NoPlan, NotPlannable
+from planner.errors import AircraftProfileError, NoPlan, NotPlannable
 from tests.api.bodies import PREVIEW, PROBLEM, SUBMIT, intent, problem
 from tests.api.serving import Client, served, serving
 from tests.ledger.process import FakeClock, until, write_lock
@@ -269,7 +269,8 @@ def all_subclasses(cls: type[Exception]) -> list[type[Exception]]:
 
 
 @pytest.mark.parametrize(
-    "error", [sub for base in (RequestError, NotPlannable, NoPlan) for sub in all_subclasses(base)]
+    "error",
+    [AircraftProfileError, *(sub for base in (RequestError, NotPlannable, NoPlan) for sub in all_subclasses(base))],
 )
 def test_every_error_a_request_can_meet_has_its_kind_of_problem(error: type[Exception]) -> None:
     assert problems.kind_of(error("why")).status in range(400, 504)

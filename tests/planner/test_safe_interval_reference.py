@@ -1,6 +1,6 @@
 """The planner against the plain safe-interval planner, in airspaces and traffic that are too large for ticks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -121,3 +121,25 @@ def test_the_plain_planner_refuses_to_book_twice() -> None:
     for enter_ms, exit_ms in ((24, 26), (0, 6), (12, 13)):
         with pytest.raises(AssertionError, match="block 0 is not free"):
             plain.reserve([Hold(0, enter_ms, exit_ms)])
+
+
+@given(situations(), st.sampled_from([1, 2, 4]))
+@settings(deadline=None)
+def test_with_reservations_weeks_and_months_ahead_the_planner_arrives_when_the_plain_one_does(
+    situation: Situation, half_days: int
+) -> None:
+    """Every time of the situation counts so many half days, but links take what they take."""
+    unit = half_days * 43_200_000
+    reservations = [Hold(block, enter * unit, exit_ * unit) for block, enter, exit_ in situation.reservations]
+    request = replace(
+        situation.request,
+        earliest_departure_ms=situation.request.earliest_departure_ms * unit,
+        latest_departure_ms=situation.request.latest_departure_ms * unit,
+    )
+    plain = SafeIntervalPlanner(situation.airspace)
+    plain.reserve(reservations)
+    try:
+        arrival = planner_in(situation.airspace, reservations).plan(request).arrival_ms
+    except (NoPlan, NotPlannable):
+        arrival = None
+    assert arrival == arrival_by(plain, request)
