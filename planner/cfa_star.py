@@ -129,7 +129,7 @@ class Planner:
         """Return the flight time without traffic in ms, dwell included: A* under the airspace's rule."""
         self.check(request.origin, request.destination)
         bounds = self._bounds(self._motion(request.performance), request.origin, request.destination)
-        return bounds.optimum + 2 * self.airspace.terminal_dwell_ms
+        return int(bounds.optimum) + 2 * self.airspace.terminal_dwell_ms
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to these blocks, if any."""
@@ -275,7 +275,8 @@ class Planner:
             hold_exit_ms=hold_exit,
             earliest_departure_ms=task.earliest,
             slot_opens_ms=slot_opens_ms,
-            unconstrained_ms=bounds.optimum + 2 * task.dwell,
+            # Without the JIT kernels return numpy's integers.
+            unconstrained_ms=int(bounds.optimum) + 2 * task.dwell,
             terminal_dwell_ms=task.dwell,
             expansions=expansions,
             static_expansions=bounds.expansions,
