@@ -47,7 +47,7 @@ def paper(
             if not kernels_are_compiled():
                 remark("note", "cyan", "compiling the planner's kernels, once per version; this takes some ten seconds")
             warm_up()
-            with progress_bar("flights", design.workload) as advance_to:
+            with progress_bar("flights", design.workload(field)) as advance_to:
                 study = conduct(field, design, advance_to)
             # The figures need matplotlib, which no other command waits for.
             from planner.experiments.report import Provenance, build_report

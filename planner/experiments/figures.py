@@ -26,7 +26,7 @@ from planner.cfa_star import Search
 from planner.experiments import paper
 from planner.experiments.cases import Case, Comparison
 from planner.experiments.metrics import positions
-from planner.experiments.study import NearMiss, Reference, Run, Trade, Trial, UseByType
+from planner.experiments.study import Balance, NearMiss, Reference, Run, Trade, Trial, UseByType
 from planner.experiments.traffic import Od
 from planner.path import Plan, Trajectory
 
@@ -408,7 +408,43 @@ def layer_shares(grid: AirMatrix, uses: Sequence[UseByType]) -> Figure:
     uses = sorted(uses, key=lambda use: use.speed_ratio)
     figure = _figure(0.7 + 0.33 * len(uses))
     ax = figure.subplots()
-    shares = np.array([_by_layer(grid, use.in_use_s).sum(axis=(1, 2)) for use in uses])
+    _draw_shares(ax, grid, [use.in_use_s for use in uses], least_named=6)
+    ax.set_yticks(range(len(uses)), [f"{use.aircraft.name} ({use.speed_ratio:.2f})" for use in uses])
+    ax.set_xlabel("share of the time for which blocks are held, %")
+    return figure
+
+
+@_drawn_as("svg")
+def altitude_balance(airspace: Airspace, balances: Sequence[Balance], prices_s: Sequence[float]) -> Figure:
+    """Shares of the layers at each weight of surcharges, the layers' shares of the free blocks, and each price."""
+    figure = _figure(0.8 + 0.33 * (len(balances) + 1))
+    bars, price = figure.subplots(1, 2, sharey=True, width_ratios=(1.9, 1))
+    free = (~airspace.occupied).astype(np.float64)
+    _draw_shares(bars, airspace.grid, [*(balance.in_use_s for balance in balances), free], least_named=11)
+    names = [f"{balance.weight_ms:,} ms a link" if balance.weight_ms else "no surcharge" for balance in balances]
+    bars.set_yticks(range(len(balances) + 1), [*names, "free blocks"])
+    bars.get_yticklabels()[-1].set_style("italic")
+    bars.axhline(len(balances) - 0.5, color=_GREY, lw=0.7, ls=":")
+    bars.set_xlabel("share of the time for which blocks are held, %")
+    rows = range(len(balances))
+    price.hlines(rows, 0, prices_s, color=_BLUE, lw=1.3)
+    price.plot(prices_s, rows, "o", color=_BLUE)
+    price.axvline(0, color="black", lw=0.7)
+    price.set_xlabel("flight time more, s a flight")
+    price.margins(x=0.3)
+    for row, value in zip(rows, prices_s, strict=True):
+        text = f"{value:+.2f}".replace("-", "−") if abs(value) >= 0.005 else "0"
+        aside, align = (6, "left") if value > -0.005 else (-6, "right")
+        price.annotate(text, (value, row), xytext=(aside, 0), textcoords="offset points", va="center", ha=align)
+    price.spines["left"].set_visible(False)
+    price.tick_params(axis="y", length=0)
+    price.grid(axis="x")
+    return figure
+
+
+def _draw_shares(ax: Axes, grid: AirMatrix, uses: Sequence[FloatArray], least_named: float) -> None:
+    """Draw bars of the layers' shares of uses of the blocks; shares from `least_named` % on are written into them."""
+    shares = np.array([_by_layer(grid, use).sum(axis=(1, 2)) for use in uses])
     shares = 100 * shares / np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
     colours = mpl.colormaps["Blues"](np.linspace(0.25, 0.85, grid.dimensions[2]))
     left = np.zeros(len(uses))
@@ -416,18 +452,16 @@ def layer_shares(grid: AirMatrix, uses: Sequence[UseByType]) -> Figure:
         label = _layer_name(grid, layer) if grid.dimensions[2] <= _MOST_MAPS else None
         ax.barh(range(len(uses)), shares[:, layer], left=left, color=colour, ec="white", lw=0.6, label=label)
         for row, share in enumerate(shares[:, layer]):
-            if share >= 6:
+            if share >= least_named:
                 ax.text(left[row] + share / 2, row, f"{share:.1f} %", ha="center", va="center",
                         color="white" if colour[:3].mean() < 0.55 else "black")  # fmt: skip
         left += shares[:, layer]
-    ax.set_yticks(range(len(uses)), [f"{use.aircraft.name} ({use.speed_ratio:.2f})" for use in uses])
     ax.invert_yaxis()
-    ax.set(xlim=(0, 100), xlabel="share of the time for which blocks are held, %")
+    ax.set_xlim(0, 100)
     ax.spines["left"].set_visible(False)
     ax.tick_params(axis="y", length=0)
     if grid.dimensions[2] <= _MOST_MAPS:
         ax.legend(ncols=min(grid.dimensions[2], 5), loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2)
-    return figure
 
 
 # Beyond the paper

@@ -21,7 +21,8 @@ from planner.experiments.block_sizing import (
     size_block,
 )
 from planner.experiments.cases import Case, Comparison
-from planner.experiments.study import Reference, Run, Trade, Trial, UseByType
+from planner.experiments.study import Balance, Reference, Run, Trade, Trial, UseByType
+from planner.path import Plan
 
 # Printed speeds have three decimals, drag constants three digits.
 _PRINTED_ALIKE_MPS = 0.0025
@@ -113,8 +114,13 @@ def performance_of(aircraft: AircraftType) -> Performance:
 
 @dataclass(frozen=True)
 class Growth:
-    """How the computing time of CFA* grows with the flights already planned."""
+    """How the computing time of greedy CFA* compares with that of A*, and grows with the flights already planned.
 
+    `ratio_beyond` compares what both take beyond the search without traffic; None where that is too short to tell.
+    """
+
+    ratio: float
+    ratio_beyond: float | None
     extra_a_flight_s: float
     first_third_s: float
     last_third_s: float
@@ -124,8 +130,16 @@ def growth(reference: Reference) -> Growth:
     """Compare greedy CFA* with A*, and its first third of flights with its last."""
     seconds = reference.greedy.seconds
     third = max(len(seconds) // 3, 1)
-    extra = float(seconds.sum() - reference.astar.seconds.sum()) / len(seconds)
-    return Growth(extra, float(seconds[:third].mean()), float(seconds[-third:].mean()))
+    greedy, astar, shared = (
+        float(times.sum()) for times in (seconds, reference.astar.seconds, reference.without_traffic_s)
+    )
+    return Growth(
+        ratio=greedy / astar,
+        ratio_beyond=(greedy - shared) / (astar - shared) if min(greedy, astar) > shared else None,
+        extra_a_flight_s=(greedy - astar) / len(seconds),
+        first_third_s=float(seconds[:third].mean()),
+        last_third_s=float(seconds[-third:].mean()),
+    )
 
 
 @dataclass(frozen=True)
@@ -278,6 +292,72 @@ def falls_with_ratio(grid: AirMatrix, uses: Sequence[UseByType]) -> bool:
     """Tell whether the use above the lowest layer never grows with the ratio of horizontal to vertical speed."""
     shares = [share_above_lowest(grid, use) for use in sorted(uses, key=lambda use: use.speed_ratio)]
     return all(before >= after for before, after in pairwise(shares))
+
+
+@dataclass(frozen=True)
+class AltitudeUse:
+    """How evenly the layers are used at one weight of surcharges, and what that costs.
+
+    `shares` (layers,) are of the time for which blocks are held. Crowding is that time for each free block; `peak` is
+    the most crowded layer's, divided by that of all layers together: 1 for even use. Times in seconds and `climb_m` are
+    means over the flights that every weight lets fly; `price_s` is flight time (departure to arrival) beyond that at
+    weight 0, `waiting_s` is on the ground or hovering.
+    """
+
+    weight_ms: int
+    shares: tuple[float, ...]
+    peak: float
+    flight_time_s: float
+    price_s: float
+    delay_s: float
+    waiting_s: float
+    climb_m: float
+    refused: int
+    too_near: int
+    computing_s: float
+
+
+def altitude_uses(airspace: Airspace, balances: Sequence[Balance]) -> tuple[AltitudeUse, ...]:
+    """Sum up the use of the layers at each weight, the first of which is 0."""
+    grid = airspace.grid
+    layers = grid.dimensions[2]
+    free = (~airspace.occupied).reshape(layers, -1).sum(axis=1)
+    flown = [
+        number
+        for number, plans in enumerate(zip(*(balance.run.plans for balance in balances), strict=True))
+        if None not in plans
+    ]
+
+    def mean(balance: Balance, measure: Callable[[Plan], float]) -> float:
+        plans = (balance.run.plans[number] for number in flown)
+        return sum(measure(plan) for plan in plans if plan is not None) / max(len(flown), 1)
+
+    def flight_time_s(plan: Plan) -> float:
+        return plan.flight_time_ms / 1000
+
+    def climb_m(plan: Plan) -> float:
+        return float(np.maximum(np.diff(grid.ijk(plan.block)[:, 2]), 0).sum()) * grid.block_height_m
+
+    uses = []
+    for balance in balances:
+        held_s = balance.in_use_s.reshape(layers, -1).sum(axis=1)
+        total_s = max(float(held_s.sum()), 1e-9)
+        uses.append(
+            AltitudeUse(
+                weight_ms=balance.weight_ms,
+                shares=tuple((held_s / total_s).tolist()),
+                peak=float((held_s / np.maximum(free, 1)).max()) * int(free.sum()) / total_s,
+                flight_time_s=mean(balance, flight_time_s),
+                price_s=mean(balance, flight_time_s) - mean(balances[0], flight_time_s),
+                delay_s=mean(balance, lambda plan: plan.delay_ms / 1000),
+                waiting_s=mean(balance, lambda plan: (plan.ground_hold_ms + plan.hover_ms) / 1000),
+                climb_m=mean(balance, climb_m),
+                refused=balance.run.refused.total(),
+                too_near=len(balance.verdict.too_near),
+                computing_s=float(balance.run.seconds.sum()),
+            )
+        )
+    return tuple(uses)
 
 
 @dataclass(frozen=True)

@@ -63,8 +63,11 @@ def draw_figures(study: Study) -> dict[str, Picture]:
         "layer-use": figures.layer_use(airspace, reference.in_use_s),
         "use-by-type": figures.use_by_type(airspace, printed),
         "layer-shares": figures.layer_shares(airspace.grid, study.use_by_type),
-        "searches": figures.searches(study.trades),
     }
+    if study.balances:
+        prices_s = [use.price_s for use in findings.altitude_uses(airspace, study.balances)]
+        pictures["altitude-balance"] = figures.altitude_balance(airspace, study.balances, prices_s)
+    pictures["searches"] = figures.searches(study.trades)
     if reference.near_misses:
         contained = len(reference.containment_verdict.too_near)
         pictures["near-miss"] = figures.near_miss(airspace, reference.greedy, reference.near_misses, contained)
@@ -146,6 +149,7 @@ def _facts(study: Study) -> dict[str, Any]:
                 reference.greedy_verdict.violations,
                 reference.containment_verdict.violations,
                 *(trial.violations for trial in study.trials),
+                *(balance.verdict.violations for balance in study.balances),
                 *(one.verdict.violations for one in study.trades),
             )
         ),
@@ -154,6 +158,7 @@ def _facts(study: Study) -> dict[str, Any]:
         "above": {use.aircraft.id: findings.share_above_lowest(airspace.grid, use) for use in study.use_by_type},
         "printed_fall": findings.falls_with_ratio(airspace.grid, printed_types),
         "all_fall": findings.falls_with_ratio(airspace.grid, study.use_by_type),
+        "altitude": findings.altitude_uses(airspace, study.balances),
         "compared": findings.compare_searches(study.trades),
         "price": findings.price_of_containment(reference),
         "Od": Od,
@@ -178,8 +183,8 @@ def plural(value: float, noun: str) -> str:
 
 
 def fixed(value: float, decimals: int = 1) -> str:
-    """Format a number with so many decimals, thousands separators and a minus sign."""
-    return f"{value:,.{decimals}f}".replace("-", "−")
+    """Format a number with so many decimals, thousands separators and a minus sign, which a rounded zero has not."""
+    return f"{value:z,.{decimals}f}".replace("-", "−")
 
 
 def percent(share: float, decimals: int = 1) -> str:

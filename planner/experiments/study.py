@@ -8,7 +8,9 @@ paper says nothing of flights whose first block is taken.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from planner.airmatrix import FloatArray, IntArray
 from planner.airspace import Airspace, OccupancyRule
 from planner.cfa_star import Performance, Planner, PlanRequest, Search
 from planner.errors import NoPlan, NotPlannable, PlannerError
-from planner.experiments import cases, paper
+from planner.experiments import altitude, cases, paper
 from planner.experiments.metrics import CornerCuts, Encounter, conflicts_added, corner_cuts, encounter, seconds_in_use
 from planner.experiments.traffic import PAPER_AIRCRAFT, Demand, Flight, Od, random_flights, terminals
 from planner.path import Plan
@@ -25,6 +27,8 @@ from planner.separation import Approach, CheckedFlight, Kind, verify
 
 GROUND_HOLD_MS = 300_000
 HOVER_LIMIT_MS = 60_000
+
+T = TypeVar("T")
 
 
 class NothingToStudy(PlannerError):
@@ -53,12 +57,13 @@ class Design:
         count = min(seeds, 3) if quick else seeds
         return cls(flights, tuple(range(first_seed, first_seed + count)), sizes, timings=1 if quick else 5)
 
-    @property
-    def workload(self) -> int:
-        """How many flights are planned in all."""
-        reference = 4 * (self.timings + 1) + len(_types_compared())
+    def workload(self, airspace: Airspace) -> int:
+        """Return how many flights are planned in all."""
+        reference = 5 * (self.timings + 1) + len(_types_compared())
         density = 3 * len(self.windows_min) * len(self.seeds)
-        return self.flights * (reference + density) + sum(self.sizes) * len(Od) * len(OccupancyRule) * len(Search)
+        balancing = len(altitude.WEIGHTS_MS) if altitude.lets_flights_choose(airspace) else 0
+        scenarios = reference + density + balancing
+        return self.flights * scenarios + sum(self.sizes) * len(Od) * len(OccupancyRule) * len(Search)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,11 @@ class Run:
         """Blocks expanded in all."""
         return sum(plan.expansions for plan in self.accepted)
 
+    @property
+    def static_expansions(self) -> int:
+        """Blocks expanded by the searches without traffic, with which plans begin."""
+        return sum(plan.static_expansions for plan in self.accepted)
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -131,6 +141,10 @@ class NearMiss:
 class Reference:
     """The paper's scenario once: A* and both searches under the midpoint rule, and safe-interval under containment.
 
+    `astar` is the paper's: the greedy search with nothing reserved. `safe_interval_alone` is the other search with
+    nothing reserved. Every plan begins with a search without traffic, which by itself takes `without_traffic_s`
+    (flights,).
+
     `conflicts` (flights,) is what each A* trajectory adds to the paper's metric, `whole_second_conflicts` the same with
     occupations widened to whole seconds, and `conflicts_left` the metric over the trajectories of greedy CFA*.
     `comparisons` has the flights that both A* and greedy CFA* planned. `near_misses` are those of the greedy run, the
@@ -139,8 +153,10 @@ class Reference:
 
     astar: Run
     greedy: Run
+    safe_interval_alone: Run
     safe_interval: Run
     containment: Run
+    without_traffic_s: FloatArray
     conflicts: IntArray
     whole_second_conflicts: IntArray
     conflicts_left: int
@@ -184,6 +200,20 @@ class UseByType:
         return self.aircraft.max_horizontal_speed_mps / self.aircraft.max_vertical_speed_mps
 
 
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """The reference traffic by safe-interval CFA*, midpoint, with surcharges on links into crowded layers.
+
+    Before each flight a layer's surcharge is `weight_ms` times its crowding by that of the most crowded layer.
+    `in_use_s` (blocks,): seconds for which each block is held.
+    """
+
+    weight_ms: int
+    run: Run
+    in_use_s: FloatArray
+    verdict: Verdict
+
+
 @dataclass(frozen=True)
 class Trade:
     """One rule and search on one size of traffic. `delay_s` is the sum over flights that were not refused."""
@@ -208,13 +238,14 @@ class Trade:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """All that was measured."""
+    """All that was measured. There are no `balances` where flights have one layer to fly in."""
 
     airspace: Airspace
     design: Design
     reference: Reference
     trials: tuple[Trial, ...]
     use_by_type: tuple[UseByType, ...]
+    balances: tuple[Balance, ...]
     trades: tuple[Trade, ...]
 
 
@@ -241,6 +272,7 @@ def conduct(airspace: Airspace, design: Design, on_progress: Callable[[int], Non
             for seed in design.seeds
         ),
         use_by_type=use_by_type(simulator, reference.astar.flights),
+        balances=altitude_balance(simulator, reference.safe_interval) if altitude.lets_flights_choose(airspace) else (),
         trades=tuple(
             trade(simulator, Demand(od, flights, paper.WINDOW_MIN, design.seeds[0]), rule, search)
             for od in Od
@@ -274,27 +306,53 @@ class Simulator:
         """Plan flights by CFA*, each against all before it."""
         return self._fly(flights, rule, search, reserves=True)
 
-    def fly_astar(self, flights: Sequence[Flight], rule: OccupancyRule) -> Run:
-        """Plan flights by A*, each as if it were alone."""
-        return self._fly(flights, rule, Search.GREEDY, reserves=False)
+    def fly_alone(self, flights: Sequence[Flight], rule: OccupancyRule, search: Search) -> Run:
+        """Plan flights by A*, each as if it were alone: by a search of CFA* with nothing reserved."""
+        return self._fly(flights, rule, search, reserves=False)
 
-    def _fly(self, flights: Sequence[Flight], rule: OccupancyRule, search: Search, reserves: bool) -> Run:
+    def fly_balanced(self, flights: Sequence[Flight], rule: OccupancyRule, weight_ms: int) -> Run:
+        """Plan flights by safe-interval CFA*, each with surcharges on the layers that those before it crowd."""
+        return self._fly(flights, rule, Search.SAFE_INTERVAL, reserves=True, weight_ms=weight_ms)
+
+    def time_without_traffic(self, flights: Sequence[Flight], rule: OccupancyRule) -> FloatArray:
+        """Return how many seconds the search without traffic takes, with which every plan begins: (flights,)."""
+        planner = self._planner(rule, Search.SAFE_INTERVAL)
+        seconds = []
+        for flight in flights:
+            request = self._request(flight)
+            began = time.perf_counter()
+            with suppress(NotPlannable):
+                planner.unconstrained(request)
+            seconds.append(time.perf_counter() - began)
+        return np.array(seconds)
+
+    def _planner(self, rule: OccupancyRule, search: Search) -> Planner:
         if (rule, search) not in self._planners:
             self._planners[rule, search] = Planner(self.airspaces[rule], search, HOVER_LIMIT_MS)
-        planner = self._planners[rule, search]
+        return self._planners[rule, search]
+
+    def _request(self, flight: Flight, layer_surcharge_ms: tuple[int, ...] = ()) -> PlanRequest:
+        return PlanRequest(
+            flight.origin,
+            flight.destination,
+            self.performances[flight.aircraft],
+            flight.departure_ms,
+            flight.departure_ms + GROUND_HOLD_MS,
+            layer_surcharge_ms,
+        )
+
+    def _fly(
+        self, flights: Sequence[Flight], rule: OccupancyRule, search: Search, reserves: bool, weight_ms: int = 0
+    ) -> Run:
+        planner = self._planner(rule, search)
         planner.index.clear()
+        crowding = altitude.Crowding(self.airspaces[rule])
         plans: list[Plan | None] = []
         refusals: list[str | None] = []
         seconds = []
         for number, flight in enumerate(flights):
             plan, refusal = None, None
-            request = PlanRequest(
-                flight.origin,
-                flight.destination,
-                self.performances[flight.aircraft],
-                flight.departure_ms,
-                flight.departure_ms + GROUND_HOLD_MS,
-            )
+            request = self._request(flight, crowding.surcharges_ms(weight_ms) if weight_ms else ())
             began = time.perf_counter()
             try:
                 plan = planner.plan(request)
@@ -303,6 +361,8 @@ class Simulator:
             except (NoPlan, NotPlannable) as error:
                 refusal = error.reason
             seconds.append(time.perf_counter() - began)
+            if plan is not None:
+                crowding.add(plan)
             plans.append(plan)
             refusals.append(refusal)
             self._planned += 1
@@ -344,21 +404,25 @@ def simulate_reference(simulator: Simulator, design: Design) -> Reference:
     """Simulate the paper's scenario with the design's first seed."""
     flights = simulator.flights(Demand(Od.UNIFORM, design.flights, paper.WINDOW_MIN, design.seeds[0]))
     midpoint = OccupancyRule.MIDPOINT
-    astar = _timed(design.timings, lambda: simulator.fly_astar(flights, midpoint))
+    astar = _timed(design.timings, lambda: simulator.fly_alone(flights, midpoint, Search.GREEDY))
     if not astar.accepted:
         raise NothingToStudy(f"buildings part the ends of all {len(flights)} flights of the paper's scenario")
     greedy = _timed(design.timings, lambda: simulator.fly(flights, midpoint, Search.GREEDY))
+    safe_interval_alone = _timed(design.timings, lambda: simulator.fly_alone(flights, midpoint, Search.SAFE_INTERVAL))
     safe_interval = _timed(design.timings, lambda: simulator.fly(flights, midpoint, Search.SAFE_INTERVAL))
     containment = _timed(
         design.timings, lambda: simulator.fly(flights, OccupancyRule.CONTAINMENT, Search.SAFE_INTERVAL)
     )
+    without_traffic_s = _passes(design.timings, lambda: simulator.time_without_traffic(flights, midpoint))
     verdict = simulator.judge(greedy)
     airspace = simulator.airspaces[midpoint]
     return Reference(
         astar=astar,
         greedy=greedy,
+        safe_interval_alone=safe_interval_alone,
         safe_interval=safe_interval,
         containment=containment,
+        without_traffic_s=np.median(without_traffic_s, axis=0),
         conflicts=_conflicts(astar),
         whole_second_conflicts=_conflicts(astar, in_whole_seconds=True),
         conflicts_left=int(conflicts_added(greedy.accepted).sum()),
@@ -397,7 +461,7 @@ def simulate_trial(simulator: Simulator, flights: int, window_min: int, seed: in
     """Simulate one seed's traffic within one window."""
     drawn = simulator.flights(Demand(Od.UNIFORM, flights, window_min, seed))
     midpoint = OccupancyRule.MIDPOINT
-    astar = simulator.fly_astar(drawn, midpoint)
+    astar = simulator.fly_alone(drawn, midpoint, Search.GREEDY)
     greedy = simulator.fly(drawn, midpoint, Search.GREEDY)
     containment = simulator.fly(drawn, OccupancyRule.CONTAINMENT, Search.SAFE_INTERVAL)
     verdict, containment_verdict = simulator.judge(greedy), simulator.judge(containment)
@@ -430,6 +494,19 @@ def use_by_type(simulator: Simulator, flights: Iterable[Flight]) -> tuple[UseByT
     return tuple(uses)
 
 
+def altitude_balance(simulator: Simulator, unbalanced: Run) -> tuple[Balance, ...]:
+    """Simulate the flights of a run again with each weight; the run itself is the one of weight 0 and comes first."""
+    grid = simulator.airspaces[unbalanced.rule].grid
+    runs = {0: unbalanced} | {
+        weight_ms: simulator.fly_balanced(unbalanced.flights, unbalanced.rule, weight_ms)
+        for weight_ms in altitude.WEIGHTS_MS
+    }
+    return tuple(
+        Balance(weight_ms, run, seconds_in_use(run.accepted, grid.block_count), simulator.judge(run))
+        for weight_ms, run in runs.items()
+    )
+
+
 def trade(simulator: Simulator, demand: Demand, rule: OccupancyRule, search: Search) -> Trade:
     """Simulate one demand under one rule and search."""
     run = simulator.fly(simulator.flights(demand), rule, search)
@@ -454,10 +531,15 @@ def _types_compared() -> tuple[str, ...]:
 
 
 def _timed(passes: int, fly: Callable[[], Run]) -> Run:
-    """Return a run with each flight's median time of several passes, after one that does not count."""
-    fly()
-    runs = [fly() for _ in range(passes)]
+    """Return a run with each flight's median time of several passes."""
+    runs = _passes(passes, fly)
     return replace(runs[0], seconds=np.median([run.seconds for run in runs], axis=0))
+
+
+def _passes(passes: int, measure: Callable[[], T]) -> list[T]:
+    """Measure several times, after a first time that does not count."""
+    measure()
+    return [measure() for _ in range(passes)]
 
 
 def _sum(seconds: FloatArray) -> float:

@@ -5,7 +5,7 @@ import io
 from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
-from planner.experiments.findings import LayerUse, layer_uses, performance_of
+from planner.experiments.findings import AltitudeUse, LayerUse, altitude_uses, layer_uses, performance_of
 from planner.experiments.study import NearMiss, Run, Study, Trade, Trial, UseByType
 
 Cell = str | int | float | None
@@ -20,6 +20,7 @@ def all_tables(study: Study) -> dict[str, str]:
         "searches.csv": _searches(study),
         "near_misses.csv": _near_misses(study),
         "layers.csv": _layers(study),
+        "altitude.csv": _altitude(study),
         "aircraft.csv": _aircraft(study),
     }
 
@@ -44,7 +45,9 @@ def _flights(study: Study) -> str:
         "destination": lambda number: " ".join(map(str, grid.block(flights[number].destination))),
         "departure_s": lambda number: flights[number].departure_ms / 1000,
         "astar_s": lambda number: None if (plan := astar.plans[number]) is None else plan.flight_time_ms / 1000,
+        "without_traffic_computing_ms": lambda number: round(1000 * float(reference.without_traffic_s[number]), 4),
         "astar_computing_ms": lambda number: _ms(astar, number),
+        "safe_interval_alone_computing_ms": lambda number: _ms(reference.safe_interval_alone, number),
         "astar_conflicts": lambda number: int(reference.conflicts[number]),
         "astar_whole_second_conflicts": lambda number: int(reference.whole_second_conflicts[number]),
         "case": cases.get,
@@ -144,6 +147,29 @@ def _layers(study: Study) -> str:
         "held_s": lambda entry: round(entry[2], 3),
     }
     return _table(held, columns)
+
+
+def _altitude(study: Study) -> str:
+    """The use of the layers at every weight of surcharges; nothing where there is one layer to fly in."""
+    columns: dict[str, Callable[[AltitudeUse], Cell]] = {
+        "weight_ms": lambda use: use.weight_ms,
+        "refused": lambda use: use.refused,
+        "most_crowded_by_mean": lambda use: round(use.peak, 4),
+        "flight_time_s": lambda use: round(use.flight_time_s, 4),
+        "price_s": lambda use: round(use.price_s, 4),
+        "delay_s": lambda use: round(use.delay_s, 4),
+        "waiting_s": lambda use: round(use.waiting_s, 4),
+        "climb_m": lambda use: round(use.climb_m, 3),
+        "pairs_too_near": lambda use: use.too_near,
+        "computing_s": lambda use: round(use.computing_s, 4),
+    }
+    for layer in range(study.airspace.grid.dimensions[2]):
+        columns[f"share_of_layer_{layer}"] = _share_of(layer)
+    return _table(altitude_uses(study.airspace, study.balances), columns)
+
+
+def _share_of(layer: int) -> Callable[[AltitudeUse], Cell]:
+    return lambda use: round(use.shares[layer], 5)
 
 
 def _aircraft(study: Study) -> str:

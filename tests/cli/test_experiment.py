@@ -19,8 +19,9 @@ from tests.cli.serving import AIRMATRIX, environment
 QUICK = ("--quick", "--flights", 20, "--seeds", 1)
 COLUMNS = {
     "flights.csv": [
-        "flight", "aircraft", "origin", "destination", "departure_s", "astar_s", "astar_computing_ms",
-        "astar_conflicts", "astar_whole_second_conflicts", "case",
+        "flight", "aircraft", "origin", "destination", "departure_s", "astar_s", "without_traffic_computing_ms",
+        "astar_computing_ms", "safe_interval_alone_computing_ms", "astar_conflicts",
+        "astar_whole_second_conflicts", "case",
         "greedy_delay_s", "greedy_hold_s", "greedy_hover_s", "greedy_refused", "greedy_computing_ms",
         "safe_interval_delay_s", "safe_interval_hold_s", "safe_interval_hover_s", "safe_interval_refused",
         "safe_interval_computing_ms",
@@ -38,6 +39,10 @@ COLUMNS = {
     ],
     "near_misses.csv": ["first_flight", "second_flight", "time_s", "separation_blocks", "horizontal_m", "vertical_m"],
     "layers.csv": ["traffic", "layer", "floor_m", "ceiling_m", "free_blocks", "held_s"],
+    "altitude.csv": [
+        "weight_ms", "refused", "most_crowded_by_mean", "flight_time_s", "price_s", "delay_s", "waiting_s", "climb_m",
+        "pairs_too_near", "computing_s", "share_of_layer_0", "share_of_layer_1", "share_of_layer_2",
+    ],
     "aircraft.csv": [
         "aircraft", "mass_kg", "vertical_mps", "horizontal_mps", "drag_kg_per_m", "power_w", "alpha_printed_mps",
         "alpha_mps", "beta_printed_mps", "beta_mps", "airspace_alpha_mps", "airspace_beta_mps",

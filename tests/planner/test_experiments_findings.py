@@ -201,6 +201,10 @@ def test_growth_compares_thirds_of_the_flights() -> None:
     reference = district_study().reference
     greedy = replace(reference.greedy, seconds=np.array([1.0, 3, 5, 5, 9, 11]))
     astar = replace(reference.astar, seconds=np.full(6, 2.0))
-    growth = findings.growth(replace(reference, greedy=greedy, astar=astar))
+    reference = replace(reference, greedy=greedy, astar=astar, without_traffic_s=np.full(6, 0.5))
+    growth = findings.growth(reference)
     assert (growth.first_third_s, growth.last_third_s) == (2, 10)
     assert growth.extra_a_flight_s == pytest.approx(22 / 6)
+    assert growth.ratio == pytest.approx(34 / 12)
+    assert growth.ratio_beyond == pytest.approx(31 / 9)
+    assert findings.growth(replace(reference, without_traffic_s=np.full(6, 2.0))).ratio_beyond is None

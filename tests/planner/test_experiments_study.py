@@ -53,7 +53,7 @@ def test_the_airspaces_own_rule_and_dwell_do_not_count(study: Study) -> None:
 def test_progress_counts_every_flight_of_the_workload() -> None:
     told: list[int] = []
     conduct(district(), DESIGN, told.append)
-    assert told == list(range(1, DESIGN.workload + 1))
+    assert told == list(range(1, DESIGN.workload(district()) + 1))
 
 
 def test_the_district_is_busy_enough_to_show_everything(study: Study) -> None:
@@ -71,6 +71,21 @@ def test_astar_flies_as_if_alone(study: Study) -> None:
         assert plan.departure_ms == flight.departure_ms
         assert plan.flight_time_ms == plan.unconstrained_ms
     assert set(astar.delay_s) == {0.0}
+
+
+def test_both_searches_take_the_same_time_alone(study: Study) -> None:
+    astar, other = study.reference.astar, study.reference.safe_interval_alone
+    assert other.flights == astar.flights
+    assert [plan.arrival_ms for plan in other.accepted] == [plan.arrival_ms for plan in astar.accepted]
+    # The safe-interval search goes on from what the search without traffic found, greedy begins anew.
+    assert other.static_expansions == astar.static_expansions
+    assert astar.static_expansions < other.expansions
+
+
+def test_the_search_without_traffic_is_timed_flight_by_flight_even_where_there_is_no_way(study: Study) -> None:
+    assert study.reference.without_traffic_s.shape == (len(study.reference.astar.flights),)
+    flights = [Flight(0, 3, "dji-phantom-4", 0), Flight(0, 1, "dji-phantom-4", 0)]
+    assert Simulator(drawn("..#.").airspace).time_without_traffic(flights, OccupancyRule.MIDPOINT).shape == (2,)
 
 
 def test_conflicts_are_those_of_astar_and_cfa_star_leaves_none(study: Study) -> None:
@@ -144,7 +159,7 @@ def test_each_type_flies_the_same_flights(study: Study) -> None:
 def test_flights_that_buildings_part_are_refused_and_keep_their_number() -> None:
     airspace = drawn("..#.").airspace
     flights = [Flight(0, 1, "dji-phantom-4", 0), Flight(0, 3, "dji-phantom-4", 0), Flight(0, 1, "dji-phantom-4", 0)]
-    run = Simulator(airspace).fly_astar(flights, OccupancyRule.MIDPOINT)
+    run = Simulator(airspace).fly_alone(flights, OccupancyRule.MIDPOINT, Search.GREEDY)
     assert run.refusals == (None, "disconnected", None)
     assert [plan is None for plan in run.plans] == [False, True, False]
     assert run.refused == Counter({"disconnected": 1})
