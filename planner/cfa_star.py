@@ -173,6 +173,7 @@ class Planner:
         else:
             status, label, further = self._run(search_kernels.safe_interval, motion, task, bounds)
         expansions = bounds.expansions + further
+        visits = int(self._workspace.around[VISITS])
         if status == search_kernels.NO_DEPARTURE_SLOT:
             owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
             return NoDepartureSlot(
@@ -184,15 +185,16 @@ class Planner:
                 self._owners_around(label),
                 expansions=expansions,
             )
-        plan = self._plan(motion, task, bounds, label, expansions)
+        plan = self._plan(motion, task, bounds, label, expansions, visits)
         endurance = request.performance.endurance_ms
         if endurance is None or plan.flight_time_ms <= endurance:
             return plan
         if self.search is Search.SAFE_INTERVAL:
             status, label, further = self._run(within_endurance, motion, task, bounds, endurance)
             expansions += further
+            visits += int(self._workspace.around[VISITS])
             if status == search_kernels.FOUND:
-                return self._plan(motion, task, bounds, label, expansions)
+                return self._plan(motion, task, bounds, label, expansions, visits)
         return EnduranceExceeded(
             f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s",
             expansions=expansions,
@@ -254,10 +256,9 @@ class Planner:
         self._static_stamp += 1
         return self._static_stamp
 
-    def _plan(self, motion: Motion, task: Task, bounds: Bounds, goal: int, expansions: int) -> Plan:
+    def _plan(self, motion: Motion, task: Task, bounds: Bounds, goal: int, expansions: int, visits: int) -> Plan:
         """Turn the labels of a finished search into a plan."""
         ws = self._workspace
-        visits = int(ws.around[VISITS])
         block, arrive, depart, gap_end = path_kernels.trace(ws.labels, goal, task)
         slot_opens_ms = int(arrive[0])
         if self.search is Search.SAFE_INTERVAL:

@@ -21,7 +21,7 @@ from planner.kernels.labels import (
     can_end,
     gap_bounds,
 )
-from planner.kernels.motion import OFFSET, SIDE, SIDES, STEPS, TAIL, TIME, Motion, coordinates, first_start
+from planner.kernels.motion import OFFSET, SIDE, SIDES, STEPS, TAIL, TIME, VISITS, Motion, coordinates, first_start
 from planner.kernels.policy import kernel
 from planner.kernels.search import FOUND, NO_PATH, WORKSPACE_FULL, open_departures, open_label
 from planner.kernels.static_search import Bounds, time_to_go
@@ -80,6 +80,7 @@ def within_endurance(
     shape, links, near = motion
     table, pool, _ = slabs
     marks, labels, _, around, _, heap, _, field = ws
+    around[VISITS] = 0
     i, j, k = bounds.start
     h, rank = time_to_go(field, shape, near, bounds, task.origin, i, j, k)
     count = open_departures(h, rank, table, pool, marks, labels, task)

@@ -76,9 +76,9 @@ def new_workspace(block_count: int, label_count: int) -> Workspace:
 
 
 def larger_workspace(ws: Workspace) -> Workspace:
-    """Return memory for twice as many labels, with the marks and counts that this one holds."""
+    """Return memory for twice as many labels, with the marks that this one holds."""
     larger = new_workspace(0, 2 * len(ws.labels))
-    return larger._replace(marks=ws.marks, field=ws.field, around=ws.around)
+    return larger._replace(marks=ws.marks, field=ws.field)
 
 
 @kernel

@@ -192,6 +192,7 @@ def safe_interval(
                 pending[label, link] = links[link, TIME] + h - labels[label, H]
             tau = min(tau, F + pending[label, link] - links[link, TIME] - h)
         least = NEVER
+        is_full = False
         for link in range(26):
             detour = pending[label, link]
             if detour == NEVER:
@@ -229,12 +230,16 @@ def safe_interval(
                 detour = s + links[link, TIME] + h - F
                 if s > last or F + detour > bound:
                     break
-                # A detour of weeks, which NEVER would hide, is made at once, but only while there is room.
-                is_full = count + 26 > labels.shape[0] or size + 27 > heap.shape[0]
-                if until < detour < NEVER or is_full:
-                    pending[label, link] = min(detour, NEVER - 1)
-                    least = min(least, pending[label, link])
+                # A detour of weeks, which NEVER would hide, is made at once.
+                if until < detour < NEVER:
+                    pending[label, link] = detour
+                    least = min(least, detour)
                     break
+                if count + 26 > labels.shape[0] or size + 27 > heap.shape[0]:
+                    is_full = True
+                    break
+        if is_full:
+            return WORKSPACE_FULL, -1, expansions
         if least < NEVER and F + least <= bound:
             size = open_label(heap, size, labels, label, max(F + least, landing), task.earliest)
     return NO_PATH, count, expansions
