@@ -134,7 +134,8 @@ def test_an_interrupted_simulation_sums_up_what_it_did(airmatrix: Run, town: Ser
         env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     with Client(town.url) as client:
-        while not list(client.flight_intents(operator="interrupted")):
+        # Two: the answer to the first has arrived by then.
+        while len(list(client.flight_intents(operator="interrupted"))) < 2:
             time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=10)
