@@ -26,7 +26,8 @@ from planner.cfa_star import Search
 from planner.experiments import paper
 from planner.experiments.cases import Case, Comparison
 from planner.experiments.metrics import positions
-from planner.experiments.study import Balance, NearMiss, Reference, Run, Trade, Trial, UseByType
+from planner.experiments.simulation import Run
+from planner.experiments.study import Balance, NearMiss, Reference, Trade, Trial, UseByType
 from planner.experiments.traffic import Od
 from planner.path import Plan, Trajectory
 

@@ -21,7 +21,8 @@ from planner.experiments.block_sizing import (
     size_block,
 )
 from planner.experiments.cases import Case, Comparison
-from planner.experiments.study import Balance, Reference, Run, Trade, Trial, UseByType
+from planner.experiments.simulation import Run
+from planner.experiments.study import Balance, Reference, Trade, Trial, UseByType
 from planner.path import Plan
 
 # Printed speeds have three decimals, drag constants three digits.

@@ -14,7 +14,8 @@ from planner.experiments import figures, findings, paper
 from planner.experiments.block_sizing import PAPER_TABLE_1
 from planner.experiments.cases import Case, typical
 from planner.experiments.figures import Picture
-from planner.experiments.study import GROUND_HOLD_MS, HOVER_LIMIT_MS, Study
+from planner.experiments.simulation import GROUND_HOLD_MS, HOVER_LIMIT_MS
+from planner.experiments.study import Study
 from planner.experiments.tables import all_tables
 from planner.experiments.traffic import Od
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TypeVar
 
 from planner.experiments.findings import AltitudeUse, LayerUse, altitude_uses, layer_uses, performance_of
-from planner.experiments.study import NearMiss, Run, Study, Trade, Trial, UseByType
+from planner.experiments.simulation import Run
+from planner.experiments.study import NearMiss, Study, Trade, Trial, UseByType
 
 Cell = str | int | float | None
 T = TypeVar("T")

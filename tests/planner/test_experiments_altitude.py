@@ -7,7 +7,8 @@ from planner.airspace import Airspace, OccupancyRule
 from planner.cfa_star import Planner, PlanRequest, Search
 from planner.experiments import altitude, findings
 from planner.experiments.altitude import Crowding, lets_flights_choose
-from planner.experiments.study import GROUND_HOLD_MS, Balance, Design, Run, Simulator, Verdict, conduct
+from planner.experiments.simulation import GROUND_HOLD_MS, Run, Simulator, Verdict
+from planner.experiments.study import Balance, Design, conduct
 from planner.experiments.traffic import Demand, Flight, Od
 from planner.path import Plan
 from tests.planner.drawing import drawn

@@ -11,7 +11,8 @@ from planner.airspace import OccupancyRule
 from planner.cfa_star import Search
 from planner.experiments import findings
 from planner.experiments.metrics import CornerCuts
-from planner.experiments.study import Trade, Trial, UseByType, Verdict
+from planner.experiments.simulation import Verdict
+from planner.experiments.study import Trade, Trial, UseByType
 from planner.experiments.traffic import Od
 from tests.planner.drawing import drawn
 from tests.planner.experimenting import district_study

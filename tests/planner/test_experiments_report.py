@@ -27,7 +27,8 @@ from planner.experiments.report import (
     took,
     write_page,
 )
-from planner.experiments.study import Balance, Design, Study, Verdict, conduct
+from planner.experiments.simulation import Verdict
+from planner.experiments.study import Balance, Design, Study, conduct
 from tests.planner.drawing import drawn
 from tests.planner.experimenting import district, district_study
 

@@ -13,7 +13,8 @@ from planner.airspace import Airspace, OccupancyRule
 from planner.cfa_star import Search
 from planner.experiments import paper
 from planner.experiments.metrics import conflicts_added, encounter
-from planner.experiments.study import Design, NothingToStudy, Run, Simulator, Study, conduct, simulate_reference
+from planner.experiments.simulation import NothingToStudy, Run, Simulator
+from planner.experiments.study import Design, Study, conduct, simulate_reference
 from planner.experiments.tables import all_tables
 from planner.experiments.traffic import Demand, Flight, Od
 from tests.planner.drawing import drawn

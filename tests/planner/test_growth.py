@@ -69,7 +69,8 @@ def test_reservations_at_other_hours_cost_a_plan_nothing() -> None:
 def test_far_reservations_of_the_blocks_on_the_way_cost_a_plan_nothing() -> None:
     airspace = open_air(20, 1, 1)
     empty, booked = planner_in(airspace), planner_in(airspace)
-    for block in range(20):
+    # Every other block is always free, so a flight could wait there for each later gap of its neighbours.
+    for block in range(1, 19, 2):
         far = (Hold(block, day * 24 * HOUR_MS, day * 24 * HOUR_MS + 1) for day in range(1, 50))
         reserve(booked, far, owner=1)
     request = flight(0, 19, times=TIMES)
@@ -85,8 +86,9 @@ def test_with_room_a_flight_takes_expansions_in_proportion_to_its_length() -> No
     assert [expansions(side) <= 3 * side for side in lengths] == [True] * 3
 
 
-def test_a_detour_that_shows_only_at_the_destination_is_not_paid_for_all_the_way() -> None:
-    """A roofed yard around the destination: the lattice distance is too short by the same everywhere outside."""
+@pytest.mark.parametrize("yard_around", ["destination", "origin"])
+def test_a_detour_that_shows_only_at_one_end_is_not_paid_for_all_the_way(yard_around: str) -> None:
+    """A roofed yard around one end: the lattice distance is too short by the same everywhere outside."""
 
     def expansions(side: int) -> int:
         layers = np.zeros((LAYERS, side, side), dtype=np.bool_)
@@ -98,8 +100,10 @@ def test_a_detour_that_shows_only_at_the_destination_is_not_paid_for_all_the_way
         airspace = airspace_of(
             (side, side, LAYERS), layers.ravel(), rule=OccupancyRule.CONTAINMENT, terminal_dwell_ms=0
         )
-        destination = (side - 6) * side + side - 6
-        return Planner(airspace).plan(flight(0, destination, times=TIMES)).expansions
+        ends = [0, (side - 6) * side + side - 6]
+        if yard_around == "origin":
+            ends.reverse()
+        return Planner(airspace).plan(flight(*ends, times=TIMES)).expansions
 
     # Four times the way, sixteen times the area.
     assert expansions(160) <= 6 * expansions(40)
