@@ -5,7 +5,7 @@ INSTALLED := $(VENV)/.installed
 PEERS := $(VENV)/.peers
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test bench lint lock openapi
+.PHONY: help install serve test bench faults soak lint lock openapi
 
 help:  ## Show these targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -32,6 +32,12 @@ $(PEERS): $(INSTALLED) tests/benchmark/requirements.lock
 
 bench: $(INSTALLED) $(PEERS)  ## Time the planner; choose with PARTS="intents committed city peers"
 	$(BIN)/python -m tests.benchmark.bench $(PARTS)
+
+faults: $(INSTALLED)  ## Break the service in every way we know; choose with PARTS="kill disk ..." ROUNDS=20
+	$(BIN)/python -m tests.faults.campaign $(PARTS) $(if $(ROUNDS),--rounds $(ROUNDS))
+
+soak: $(INSTALLED)  ## A day of traffic in five minutes; choose with SECONDS=600
+	$(BIN)/python -m tests.soak.soak $(SECONDS)
 
 lint: $(INSTALLED)  ## Check style, types, layers and the container files
 	$(BIN)/ruff check

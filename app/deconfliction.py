@@ -9,11 +9,11 @@ import asyncio
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import cast
 
 import structlog
 from uuid_utils import uuid7
@@ -24,12 +24,13 @@ from app.errors import (
     IdempotencyKeyReused,
     IllegalTransition,
     LedgerUnavailable,
+    OutcomeUnknown,
     QueueFull,
     RequestError,
     UnknownFlightIntent,
 )
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
-from app.ledger.ledger import CommitUncertain, Ledger, ReservationOverlap, Transaction
+from app.ledger.ledger import CommitUncertain, ConstraintViolated, Ledger, Transaction
 from app.times import format_time
 from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import NoPlan, PlannerError
@@ -45,8 +46,15 @@ _FORGET_EVERY_MS = 10_000
 _OPEN_FOR_MS = 86_400_000
 # A process that lags further behind than this many journal entries loads the ledger afresh.
 _CATCH_UP_ENTRIES = 1_000
-
-Answer = TypeVar("Answer")
+# Clocks are corrected by less than this all the time, and set back by more only if they were wrong.
+_STEP_BACK_MS = 10_000
+# How long the ledger is asked, and how often, what became of a commit.
+_LOOK_UP_S, _RETRY_S = 10.0, 0.1
+# Without requests the writer wakes up this often; while there is something to remove, this often.
+_IDLE_S, _PAUSE_S = 1.0, 0.01
+# How often retention looks for what has passed; and how much it removes at once, so that nobody waits long for it.
+_HOUSE_MS = 60_000
+_REMOVE_INTENTS, _REMOVE_ENTRIES = 32, 256
 
 
 @dataclass(frozen=True)
@@ -59,11 +67,23 @@ class IdempotencyKey:
 
 
 @dataclass(frozen=True)
+class Timing:
+    """Where a request's time went, in seconds: waiting, being planned, and from then until it was durable."""
+
+    queue_s: float = 0.0
+    plan_s: float = 0.0
+    commit_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """What became of a submission. `replayed` is the body of the first answer, where this is a repetition."""
+    """What became of a submission. `replayed` is the body of the first answer, where this is a repetition; `rendered`
+    the body of this one, where it had to be made already."""
 
     intent: FlightIntent
     replayed: bytes | None = None
+    rendered: bytes | None = None
+    timing: Timing = Timing()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,26 +95,60 @@ class PreviewPlan:
     reservations: Reservations
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """One request in the queue: what to do under the write lock, how to find out whether it was done, whom to tell."""
-
-    run: Callable[[Transaction, int], object]
-    look_up: Callable[[], object | None]
-    future: "Future[object]"
-
-
 @dataclass(frozen=True)
 class Policy:
-    """How far ahead flights may depart, and how long answers to idempotency keys are kept, in ms."""
+    """How far ahead flights may depart, how long answers to idempotency keys are kept, and flights once they have
+    ended (None: for ever), in ms; how many requests may wait."""
 
     horizon_ms: int
     idempotency_ms: int
     queue_limit: int
+    retention_ms: int | None = None
+
+
+@dataclass(frozen=True)
+class BatchReport:
+    """What became of a batch, for logs and metrics. Seconds; `answers` has an exception for a request that failed.
+
+    For each request, `queue_s` from its arrival until it was planned, `plan_s` for planning. `write_s` for
+    writing the rows of all, `commit_s` for the commit; `index_size` in reservations.
+    """
+
+    requests: Sequence["Request"]
+    answers: Sequence[object]
+    failure: Exception | None
+    queue_s: Sequence[float]
+    plan_s: Sequence[float]
+    write_s: float
+    commit_s: float
+    index_size: int
+
+
+@dataclass(eq=False)
+class Request:
+    """One request in the queue: what to do under the write lock, how to find out whether it was done, whom to tell.
+
+    Times are of `time.perf_counter`: when it arrived, when its planning began and ended.
+    """
+
+    run: Callable[[Transaction, int], object]
+    look_up: Callable[[], object | None]
+    future: "Future[object]"
+    context: Mapping[str, object]
+    arrived: float
+    begun: float = 0.0
+    planned: float = 0.0
+
+
+class _Redo(Exception):
+    """A batch cannot be written as a whole, so its requests have to be written one by one."""
 
 
 class Deconfliction:
-    """The only writer of a process. `start` it before submitting, `stop` it to finish what waits."""
+    """The only writer of a process. `start` it before submitting, `stop` it to finish what waits.
+
+    `observe` is told of every batch after it was answered; `on_death` is called if the writer thread ends by itself.
+    """
 
     def __init__(
         self,
@@ -103,20 +157,28 @@ class Deconfliction:
         performances: Mapping[str, Performance],
         clock: Callable[[], int],
         policy: Policy,
+        *,
+        observe: Callable[[BatchReport], None] = lambda _: None,
+        on_death: Callable[[], None] = lambda: None,
     ) -> None:
         self._ledger = ledger
         self._planner = planner
         self._performances = performances
         self._clock = clock
         self._policy = policy
-        self._queue: queue.Queue[_Job | None] = queue.Queue(policy.queue_limit)
+        self._observe = observe
+        self._on_death = on_death
+        self._queue: queue.Queue[Request | None] = queue.Queue(policy.queue_limit)
         self._thread = threading.Thread(target=self._work, name="ledger-writer", daemon=True)
         self._revision: int | None = None
         self._watermark_ms = 0
         self._forgotten_ms = 0
+        self._kept_house_ms = 0
+        self._pause_s = _IDLE_S
         self._stopping = False
         self._open = threading.Lock()
         self._closed = False
+        self.trouble: str | None = None
 
     def start(self) -> None:
         """Load the index and begin to take requests; raises `LedgerUnavailable`."""
@@ -137,9 +199,21 @@ class Deconfliction:
         return self._thread.is_alive() and not self._closed
 
     @property
+    def is_full(self) -> bool:
+        """Whether no more requests may wait."""
+        return self._queue.full()
+
+    @property
     def waiting(self) -> int:
         """How many requests wait."""
         return self._queue.qsize()
+
+    @property
+    def waiting_s(self) -> float:
+        """For how many seconds the first request in the queue has waited, 0 where there is none."""
+        with self._queue.mutex:
+            first = self._queue.queue[0] if self._queue.queue else None
+        return 0.0 if first is None else time.perf_counter() - first.arrived
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to two blocks whatever the traffic. Safe in any thread."""
@@ -164,7 +238,10 @@ class Deconfliction:
                 return None
             return Outcome(first.intent, replayed=first.answer)
 
-        return await self._enqueue(lambda tx, now: self._submit(tx, now, intent_id, submission, key), look_up)
+        request = self._enqueue(lambda tx, now: self._submit(tx, now, intent_id, submission, key), look_up)
+        outcome = cast(Outcome, await asyncio.wrap_future(request.future))
+        queue_s, plan_s = request.begun - request.arrived, request.planned - request.begun
+        return replace(outcome, timing=Timing(queue_s, plan_s, time.perf_counter() - request.planned))
 
     async def preview(self, submission: Submission) -> PreviewPlan | Refusal:
         """Plan a submission, record nothing; raises as `submit`."""
@@ -176,7 +253,8 @@ class Deconfliction:
                 return _refusal(error, transaction)
             return PreviewPlan(submission, plan, _reservations(plan))
 
-        return await self._enqueue(run, lambda: None)
+        request = self._enqueue(run, lambda: None)
+        return cast(PreviewPlan | Refusal, await asyncio.wrap_future(request.future))
 
     async def cancel(self, intent_id: str) -> FlightIntent:
         """Cancel an accepted intent. Before departure its reservations go, after it they stay until arrival.
@@ -190,121 +268,243 @@ class Deconfliction:
             intent = self._ledger.find(intent_id)
             return intent if intent is not None and intent.state is State.CANCELLED else None
 
-        return await self._enqueue(lambda tx, now: self._cancel(tx, now, intent_id), look_up)
+        request = self._enqueue(lambda tx, now: self._cancel(tx, now, intent_id), look_up)
+        return cast(FlightIntent, await asyncio.wrap_future(request.future))
 
-    async def _enqueue(self, run: Callable[[Transaction, int], Answer], look_up: Callable[[], Answer | None]) -> Answer:
-        future: Future[Answer] = Future()
+    def _enqueue(self, run: Callable[[Transaction, int], object], look_up: Callable[[], object | None]) -> Request:
+        request = Request(
+            run=run,
+            look_up=look_up,
+            future=Future(),
+            context=structlog.contextvars.get_contextvars(),
+            arrived=time.perf_counter(),
+        )
         with self._open:
             if not self.is_running:
                 raise LedgerUnavailable("the ledger writer has stopped")
             try:
-                self._queue.put_nowait(_Job(run, look_up, future))  # type: ignore[arg-type]
+                self._queue.put_nowait(request)
             except queue.Full:
                 raise QueueFull(f"{self._policy.queue_limit} requests are waiting; try again in a second") from None
-        return await asyncio.wrap_future(future)
+        return request
 
     def _now(self) -> int:
-        self._watermark_ms = max(self._watermark_ms, self._clock())
+        """Return the clock, which never goes back by a little; by a lot, it and the index begin again from there."""
+        clock_ms = self._clock()
+        if clock_ms < self._watermark_ms - _STEP_BACK_MS:
+            with suppress(OSError, ValueError):
+                log.warning("the clock was set back", by_s=(self._watermark_ms - clock_ms) / 1000)
+            self._watermark_ms, self._revision = clock_ms, None
+        self._watermark_ms = max(self._watermark_ms, clock_ms)
         return self._watermark_ms
 
     def _work(self) -> None:
         try:
             self._serve()
+        except BaseException as error:
+            with suppress(OSError, ValueError):
+                log.critical("the ledger writer has died", exc_info=error)
         finally:
             # Whoever still got into the queue hears of it; nobody gets in any more.
             with self._open:
                 self._closed = True
             while not self._queue.empty():
-                job = self._queue.get_nowait()
-                if job is not None and job.future.set_running_or_notify_cancel():
-                    job.future.set_exception(LedgerUnavailable("the ledger writer has stopped; nothing was recorded"))
+                request = self._queue.get_nowait()
+                if request is not None and request.future.set_running_or_notify_cancel():
+                    request.future.set_exception(
+                        LedgerUnavailable("the ledger writer has stopped; nothing was recorded")
+                    )
+            if not self._stopping:
+                self._on_death()
 
     def _serve(self) -> None:
-        while not self._stopping and (first := self._queue.get()) is not None:
-            if not first.future.set_running_or_notify_cancel():
-                continue
-            taken = [first]
-            failure: Exception | None = None
-            answers: list[object]
+        while not self._stopping:
             try:
-                answers = self._write(taken)
-            except CommitUncertain as error:
-                failure = error
-                answers = [self._look_up(job) for job in taken]
-            except Exception as error:
-                failure = error
-                known = isinstance(error, LedgerUnavailable)
-                answers = [error if known else LedgerUnavailable("the ledger writer failed")] * len(taken)
-            for job, answer in zip(taken, answers, strict=True):
-                if isinstance(answer, BaseException):
-                    job.future.set_exception(answer)
-                else:
-                    job.future.set_result(answer)
-            # A log that cannot be written (its disk is full, its reader gone) must not stop the writer.
-            with suppress(OSError, ValueError):
-                _log_batch(answers, failure)
+                first = self._queue.get(timeout=self._pause_s)
+            except queue.Empty:
+                self._keep_house()
+                continue
+            if first is None:
+                self._stopping = True
+            elif first.future.set_running_or_notify_cancel():
+                self._answer([first])
+                self._keep_house()
 
-    def _write(self, taken: list[_Job]) -> list[object]:
-        """Run the request in `taken` and those that wait behind it in one transaction; return their answers."""
+    def _answer(self, taken: list[Request]) -> None:
+        """Write the request in `taken` and those that wait behind it, and answer them."""
+        failure: Exception | None = None
+        answers: Sequence[object]
+        transaction: Transaction | None = None
+        try:
+            answers, transaction = self._write(taken)
+            self.trouble = None
+        except CommitUncertain as error:
+            failure = error
+            answers = self._look_up(taken)
+            self.trouble = str(error)
+        except Exception as error:
+            failure = error
+            known = isinstance(error, LedgerUnavailable)
+            answers = [error if known else LedgerUnavailable("the ledger writer failed; nothing was recorded")] * len(
+                taken
+            )
+            self.trouble = str(error) if known else repr(error)
+        for request, answer in zip(taken, answers, strict=True):
+            if isinstance(answer, BaseException):
+                request.future.set_exception(answer)
+            else:
+                request.future.set_result(answer)
+        report = BatchReport(
+            requests=taken,
+            answers=answers,
+            failure=failure,
+            queue_s=[max(request.begun - request.arrived, 0.0) for request in taken],
+            plan_s=[request.planned - request.begun for request in taken],
+            write_s=0.0 if transaction is None else transaction.write_s,
+            commit_s=0.0 if transaction is None else transaction.commit_s,
+            index_size=len(self._planner.index),
+        )
+        # A log that cannot be written (its disk is full, its reader gone) must not stop the writer.
+        with suppress(OSError, ValueError):
+            _log_batch(report)
+        with suppress(OSError, ValueError):
+            self._observe(report)
+
+    def _write(self, taken: list[Request]) -> tuple[list[object], Transaction]:
+        """Run the requests in one transaction; return their answers, and the transaction.
+
+        All rows are written at the end, in a few statements. Where that does not work, for one request's sake or
+        because the index was wrong, it is all done again one by one, each under a savepoint.
+        """
+        try:
+            return self._attempt(self._arrivals(taken), self._run)
+        except (_Redo, ConstraintViolated) as error:
+            with suppress(OSError, ValueError):
+                log.warning("batch is written again, one by one", requests=len(taken), cause=str(error))
+            return self._attempt(iter(taken), self._run_alone)
+
+    def _attempt(
+        self,
+        requests: Iterator[Request],
+        run: Callable[[Request, Transaction, int], object],
+    ) -> tuple[list[object], Transaction]:
         now = self._now()
         # Until this transaction is known to be committed, the index is ahead of the ledger.
         revision, self._revision = self._revision, None
         answers: list[object] = []
         with self._ledger.transaction() as transaction:
             self._catch_up(transaction, now, revision)
-            for job in self._arrivals(taken):
-                answers.append(self._run(job, transaction, now))
+            for request in requests:
+                request.begun = time.perf_counter()
+                answers.append(run(request, transaction, now))
+                request.planned = time.perf_counter()
         self._revision = transaction.revision
-        return answers
+        return answers, transaction
 
-    def _arrivals(self, taken: list[_Job]) -> Iterator[_Job]:
+    def _arrivals(self, taken: list[Request]) -> Iterator[Request]:
         """Yield the request in `taken`, then append and yield waiting ones until the batch is full."""
         yield taken[0]
         until = time.perf_counter() + BATCH_PLANNING_S
         while len(taken) < BATCH_REQUESTS and time.perf_counter() < until:
             try:
-                job = self._queue.get_nowait()
+                request = self._queue.get_nowait()
             except queue.Empty:
                 return
-            if job is None:
+            if request is None:
                 self._stopping = True
                 return
             # From here on nobody can give it up, so that its answer has a place to go.
-            if job.future.set_running_or_notify_cancel():
-                taken.append(job)
-                yield job
+            if request.future.set_running_or_notify_cancel():
+                taken.append(request)
+                yield request
 
-    def _run(self, job: _Job, transaction: Transaction, now: int) -> object:
-        """Return a request's answer, or the exception that is its answer; its neighbours are not harmed."""
+    def _run(self, request: Request, transaction: Transaction, now: int) -> object:
+        """Return a request's answer, or the exception that is its answer if it has changed nothing."""
+        before = transaction.revision
         try:
-            with transaction.savepoint():
-                return job.run(transaction, now)
+            return request.run(transaction, now)
         except LedgerUnavailable:
             raise
         except (RequestError, PlannerError) as error:
-            return error
-        except ReservationOverlap as error:
-            self._catch_up(transaction, now, revision=None)
-            return LedgerUnavailable(f"the ledger refused the reservations, nothing was recorded; try again ({error})")
+            if transaction.revision == before:
+                return error
+            raise _Redo(repr(error)) from error
+        except Exception as error:
+            raise _Redo(repr(error)) from error
+
+    def _run_alone(self, request: Request, transaction: Transaction, now: int) -> object:
+        """Return a request's answer, or the exception that is its answer; its neighbours are not harmed."""
+        try:
+            with transaction.savepoint():
+                return request.run(transaction, now)
+        except LedgerUnavailable:
+            raise
         except Exception as error:
             # Wherever it happened, the index may be ahead of what the savepoint left.
             self._catch_up(transaction, now, revision=None)
+            if isinstance(error, ConstraintViolated):
+                return LedgerUnavailable(f"the ledger refused the rows, nothing was recorded; try again ({error})")
             return error
 
-    def _look_up(self, job: _Job) -> object:
-        """Return the answer to a request whose commit is uncertain: what the ledger has of it."""
+    def _look_up(self, taken: list[Request]) -> list[object]:
+        """Return the answers to requests whose commit is uncertain: what the ledger has of them.
+
+        Under the write lock, so that a commit that is still on its way has either happened or never will.
+        """
+        give_up = time.monotonic() + _LOOK_UP_S
+        while True:
+            try:
+                with self._ledger.locked():
+                    return [
+                        request.look_up() or LedgerUnavailable("the commit failed; nothing was recorded")
+                        for request in taken
+                    ]
+            except Exception as error:
+                if time.monotonic() > give_up:
+                    unknown = OutcomeUnknown(
+                        f"the commit failed ({error}), so it is not known whether this was recorded; "
+                        "read the flight intents, or repeat the request with the same Idempotency-Key"
+                    )
+                    return [unknown] * len(taken)
+            time.sleep(_RETRY_S)
+
+    def _keep_house(self) -> None:
+        """Between batches: see whether the ledger can be written again, and remove a little of what has passed."""
+        now = self._watermark_ms
+        due = self._policy.retention_ms is not None and abs(now - self._kept_house_ms) >= _HOUSE_MS
+        if self.trouble is None and not due:
+            return
+        removed = 0
         try:
-            return job.look_up() or LedgerUnavailable("the commit failed; nothing was recorded")
-        except Exception:
-            return LedgerUnavailable(
-                "the commit failed and the ledger cannot be read: it is not known whether this was recorded; "
-                "read the flight intents, or repeat the request with the same Idempotency-Key"
-            )
+            with self._ledger.transaction() as transaction:
+                removed = self._remove_passed(transaction, now)
+                if self.trouble is not None:
+                    transaction.touch()
+            self.trouble = None
+        except Exception as error:
+            self.trouble = str(error)
+        # As long as there is more to remove, after every batch.
+        self._pause_s = _PAUSE_S if removed else _IDLE_S
+        if not removed:
+            self._kept_house_ms = now
+
+    def _remove_passed(self, transaction: Transaction, now: int) -> int:
+        """Remove some of what retention lets go, and return how much."""
+        newest_ms = transaction.newest_journal_time()
+        if self._policy.retention_ms is None or newest_ms is None:
+            return 0
+        # Counted from what the ledger has seen, so that a clock that is wrong removes nothing by itself.
+        now = min(now, newest_ms)
+        before_ms = now - self._policy.retention_ms
+        transaction.forget_answers(now - self._policy.idempotency_ms)
+        removed = transaction.remove_ended(before_ms, _REMOVE_INTENTS)
+        return removed + transaction.remove_journal(before_ms, _REMOVE_ENTRIES)
 
     def _catch_up(self, transaction: Transaction, now: int, revision: int | None) -> None:
         """Bring the index from a revision (None: from nothing) to the transaction's; drop what has passed."""
         index = self._planner.index
-        if revision is None or transaction.revision - revision > _CATCH_UP_ENTRIES:
+        lags = revision is None or transaction.revision - revision > _CATCH_UP_ENTRIES
+        if revision is None or lags or revision < transaction.journal_removed:
             index.clear()
             held = transaction.held_after(now)
             index.reserve(held.block, held.enter_ms, held.exit_ms, held.sequence)
@@ -371,12 +571,13 @@ class Deconfliction:
             reservations=None if plan is None else _reservations(plan),
             refusal=refusal,
         )
+        rendered = None
         if key is not None:
-            answer = key.render(Outcome(intent))
-            transaction.remember_answer(submission.operator, key.key, key.body_digest, intent, answer, now)
+            rendered = key.render(Outcome(intent))
+            transaction.remember_answer(submission.operator, key.key, key.body_digest, intent, rendered, now)
         held = intent.reservations
         self._planner.index.reserve(held.block, held.enter_ms, held.exit_ms, intent.sequence)
-        return Outcome(intent)
+        return Outcome(intent, rendered=rendered)
 
     def _cancel(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
         intent = transaction.find(intent_id)
@@ -399,22 +600,23 @@ class Deconfliction:
         return cancelled
 
 
-def _log_batch(answers: list[object], failure: Exception | None) -> None:
+def _log_batch(report: BatchReport) -> None:
     """Log what became of a batch, after it was answered: each intent that was recorded or changed, and what failed."""
+    failure = report.failure
     if isinstance(failure, CommitUncertain):
-        log.error("commit uncertain, requests were looked up", error=str(failure), requests=len(answers))
+        log.error("commit uncertain, requests were looked up", error=str(failure), requests=len(report.requests))
+    elif isinstance(failure, LedgerUnavailable):
+        log.error("batch failed, nothing recorded", error=str(failure), requests=len(report.requests))
     elif failure is not None:
-        log.error("batch failed, nothing recorded", requests=len(answers), exc_info=failure)
-    for answer in answers:
+        log.error("batch failed, nothing recorded", requests=len(report.requests), exc_info=failure)
+    for request, answer in zip(report.requests, report.answers, strict=True):
         if isinstance(answer, Outcome) and answer.replayed is None:
-            _log_intent(answer.intent)
+            _log_intent(answer.intent, request.context)
         elif isinstance(answer, FlightIntent):
-            _log_intent(answer)
-        elif failure is None and isinstance(answer, LedgerUnavailable):
-            log.error("index was wrong, loaded afresh", error=str(answer))
+            _log_intent(answer, request.context)
 
 
-def _log_intent(intent: FlightIntent) -> None:
+def _log_intent(intent: FlightIntent, context: Mapping[str, object]) -> None:
     reason = {} if intent.refusal is None else {"reason": intent.refusal.reason}
     log.info(
         f"flight intent {intent.state}",
@@ -422,6 +624,7 @@ def _log_intent(intent: FlightIntent) -> None:
         sequence=intent.sequence,
         operator=intent.submission.operator,
         **reason,
+        **context,
     )
 
 

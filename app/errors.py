@@ -14,7 +14,10 @@ RequestError                 answered as a problem; `app.problems` maps every on
 ├── MalformedRequest         not JSON, or not HTTP as it should be
 ├── HostNotAllowed           a Host header that is not loopback, while there is no authentication
 ├── QueueFull                more requests are waiting than allowed; nothing was taken
-└── LedgerUnavailable        the ledger failed; nothing was recorded
+├── LedgerUnavailable        the ledger failed; nothing was recorded
+├── OutcomeUnknown           the commit was lost, and the ledger cannot be asked what became of it
+├── ReadOnlyServer           this process only reads
+└── NotReady                 this process cannot serve at present
 StartupError                 the service or a command cannot start; the CLI prints it and exits with 2
 ├── LedgerMissing            no ledger at that place
 ├── ForeignLedger            a file that is no AirMatrix ledger
@@ -83,6 +86,24 @@ class QueueFull(RequestError):
 
 class LedgerUnavailable(RequestError):
     """The ledger could not be written or read; nothing was recorded."""
+
+
+class OutcomeUnknown(RequestError):
+    """The connection was lost during COMMIT and the ledger cannot be read: it is not known what was recorded."""
+
+
+class ReadOnlyServer(RequestError):
+    """This process has no writer."""
+
+
+class NotReady(RequestError):
+    """The process cannot serve at present; `waiting` requests wait, `revision` is the ledger's where it is known."""
+
+    def __init__(self, reason: str, waiting: int = 0, revision: int | None = None) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.waiting = waiting
+        self.revision = revision
 
 
 class StartupError(Exception):

@@ -13,16 +13,18 @@ from starlette.responses import RedirectResponse
 
 from app import problems, service
 from app.gate import Gate
-from app.routes import aircraft_types, airspace, events, flight_intents, health
+from app.routes import aircraft_types, airspace, events, flight_intents, health, metrics
 from app.service import Service
 from app.settings import Settings
 from app.times import now_ms
+from app.tracing import Tracing
 
 DESCRIPTION = """
 Strategic deconfliction for urban air mobility. Operators submit flight intents; each is planned in order of arrival
 against everything reserved before, and its blocks are reserved durably. Ops staff read the status of the airspace.
 
-Times are RFC 3339 with an offset, answered in UTC with milliseconds. Errors are problem documents (RFC 9457).
+Times are RFC 3339 with an offset, answered in UTC with milliseconds. Errors are problem documents (RFC 9457). Every
+answer names its request in `X-Request-ID`, and so do the logs; send one (up to 100 of `A-Za-z0-9._:-`) to choose it.
 """
 
 
@@ -58,12 +60,15 @@ def create_app(settings: Settings, clock: Callable[[], int] = now_ms, *, running
         lifespan=lifespan,
         redoc_url=None,
     )
-    for resource in (flight_intents, aircraft_types, airspace, events, health):
+    for resource in (flight_intents, aircraft_types, airspace, events, health, metrics):
         app.include_router(resource.router)
     app.include_router(problems.router)
     app.add_api_route("/", _to_documentation, include_in_schema=False)
     problems.install(app)
     app.add_middleware(Gate, settings=settings)
+    inner = app.build_middleware_stack
+    # Outside of the middleware that answers unexpected errors, where `add_middleware` cannot put it.
+    app.build_middleware_stack = lambda: Tracing(inner())  # type: ignore[method-assign]
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 

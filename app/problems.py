@@ -82,6 +82,14 @@ KINDS: dict[type[Exception], Kind] = {
     errors.LedgerUnavailable: Kind(
         "ledger-unavailable", 503, "The ledger is unavailable", "Nothing was recorded. Try again later."
     ),
+    errors.OutcomeUnknown: Kind(
+        "outcome-unknown", 503, "It is not known whether this was recorded",
+        "Read the flight intents, or repeat the request with the same Idempotency-Key.",
+    ),
+    errors.ReadOnlyServer: Kind(
+        "read-only", 421, "This server only answers reads", "Send the request to a server that writes."
+    ),
+    errors.NotReady: Kind("not-ready", 503, "The service is not ready", "`reason` says why. Ask again in a second."),
 }  # fmt: skip
 
 VALIDATION = Kind("validation-error", 422, "Invalid request", "Correct what `errors` lists.")
@@ -158,6 +166,8 @@ def response_to(error: Exception) -> Response:
         members["reason"] = error.reason
         if error.earliest_feasible_departure_ms is not None:
             members["earliest_feasible_departure"] = format_time(error.earliest_feasible_departure_ms)
+    if isinstance(error, errors.NotReady):
+        members |= {"reason": error.reason, "waiting": error.waiting, "revision": error.revision}
     headers = {"Retry-After": "1"} if kind_of(error).status == 503 else None
     return response(kind_of(error), str(error), members, headers)
 

@@ -1,8 +1,12 @@
-"""What a running process holds: built once at start, handed to the routes, closed at the end."""
+"""What a running process holds: built at its start, handed to the routes, closed at the end.
+
+A service may be several processes. `prepare` does what is done once for all of them, `started` what each does.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Annotated, cast
 
 import structlog
@@ -10,7 +14,10 @@ from fastapi import Depends, Request
 
 from app import auth
 from app.deconfliction import Deconfliction, Policy
+from app.errors import ReadOnlyServer, StartupError
 from app.ledger import Ledger, create_or_upgrade, open_ledger
+from app.ledger_probe import LedgerProbe
+from app.metrics import Metrics
 from app.settings import Settings
 from planner.aircraft import AircraftType, merged, read_aircraft_types, shipped_aircraft_types
 from planner.airspace import Airspace, read_airspace
@@ -22,15 +29,42 @@ log = structlog.get_logger()
 
 
 @dataclass(frozen=True)
+class Basis:
+    """What the processes of a service have in common: the settings, and what the files hold that they name."""
+
+    settings: Settings
+    airspace: Airspace
+    aircraft_types: Mapping[str, AircraftType]
+
+    @property
+    def fingerprint(self) -> str:
+        """A digest by which a process can tell that it has read the same as another."""
+        return sha256(f"{self.airspace.fingerprint} {self.aircraft_types}".encode()).hexdigest()
+
+    def performances(self) -> dict[str, Performance]:
+        """Return what each aircraft can do in this airspace; raises `AircraftProfileError`."""
+        return {id_: Performance.of(aircraft, self.airspace.grid) for id_, aircraft in self.aircraft_types.items()}
+
+
+@dataclass(frozen=True)
 class Service:
-    """The parts of a running service."""
+    """The parts of a running process; one that only reads has no `deconfliction`."""
 
     settings: Settings
     airspace: Airspace
     aircraft_types: Mapping[str, AircraftType]
     ledger: Ledger
-    deconfliction: Deconfliction
+    deconfliction: Deconfliction | None
     clock: Callable[[], int]
+    metrics: Metrics
+    probe: LedgerProbe
+
+    @property
+    def writer(self) -> Deconfliction:
+        """What plans and writes; raises `ReadOnlyServer` where nothing does."""
+        if self.deconfliction is None:
+            raise ReadOnlyServer("this server only answers reads; send the request to one that writes")
+        return self.deconfliction
 
 
 def load_airspace(settings: Settings) -> Airspace:
@@ -46,15 +80,35 @@ def load_aircraft_types(settings: Settings) -> dict[str, AircraftType]:
 
 @contextmanager
 def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
-    """Start the service's parts in order, and stop them in reverse.
+    """Prepare and start a service of one process; raises as `prepare`."""
+    with started(prepare(settings), clock) as service:
+        yield service
+
+
+def read_basis(settings: Settings) -> Basis:
+    """Read the files that the settings name; raises `PlannerError`."""
+    return Basis(settings, load_airspace(settings), load_aircraft_types(settings))
+
+
+def reread_basis(settings: Settings, fingerprint: str) -> Basis:
+    """Read them in another process; raises `StartupError` if they are no longer what the first process has read."""
+    basis = read_basis(settings)
+    if basis.fingerprint != fingerprint:
+        raise StartupError("airspace or aircraft types have changed since the service was started; start it anew")
+    return basis
+
+
+def prepare(settings: Settings) -> Basis:
+    """Check all that is given; unless it is only read, create, upgrade and claim the ledger, and compile the kernels.
 
     Raises
     ------
     StartupError, PlannerError
-        A file is missing, foreign or does not fit; nothing is left running.
+        A file is missing, foreign or does not fit.
     """
     auth.check_listening(settings)
-    airspace = load_airspace(settings)
+    basis = read_basis(settings)
+    airspace = basis.airspace
     log.info(
         "airspace",
         airspace=airspace.id,
@@ -63,32 +117,77 @@ def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
         occupied=airspace.occupied_per_layer,
         bounds=[round(degrees, 6) for degrees in airspace.grid.bounds],
     )
-    aircraft_types = load_aircraft_types(settings)
-    performances = {id_: Performance.of(aircraft, airspace.grid) for id_, aircraft in aircraft_types.items()}
-    create_or_upgrade(settings.ledger)
-    with closing(open_ledger(settings.ledger, airspace, claim=True)) as ledger:
-        if not kernels_are_compiled():
-            log.info("compiling the planner's kernels, once per version; this takes some ten seconds")
+    basis.performances()
+    if not settings.read_only:
+        create_or_upgrade(settings.ledger)
+    open_ledger(settings.ledger, airspace, claim=not settings.read_only).close()
+    if not settings.read_only and not kernels_are_compiled():
+        log.info("compiling the planner's kernels, once per version; this takes some ten seconds")
         warm_up()
+    return basis
+
+
+@contextmanager
+def started(basis: Basis, clock: Callable[[], int], on_death: Callable[[], None] = lambda: None) -> Iterator[Service]:
+    """Start a process's parts in order, and stop them in reverse.
+
+    `on_death` is called, in another thread, when the writer has ended by itself, after which nothing is written.
+
+    Raises
+    ------
+    StartupError, LedgerUnavailable
+        The ledger has changed since it was prepared, or fails; nothing is left running.
+    """
+    settings, airspace = basis.settings, basis.airspace
+    with closing(open_ledger(settings.ledger, airspace)) as ledger:
         # Opening the projection takes as long as a hundred plans: not in the first request.
         airspace.grid.project(*airspace.grid.bounds[:2])
-        planner = Planner(airspace, settings.search, int(settings.hover_limit_s * 1000))
-        policy = Policy(
-            horizon_ms=int(settings.horizon_days * 86_400_000),
-            idempotency_ms=int(settings.idempotency_hours * 3_600_000),
-            queue_limit=settings.queue_limit,
-        )
-        deconfliction = Deconfliction(ledger, planner, performances, clock, policy)
-        deconfliction.start()
-        log.info("ready", ledger=settings.ledger)
+        metrics = Metrics()
+        deconfliction = None
+        if not settings.read_only:
+            deconfliction = _writer(basis, ledger, clock, metrics, on_death)
         try:
-            yield Service(settings, airspace, aircraft_types, ledger, deconfliction, clock)
+            yield Service(
+                settings=settings,
+                airspace=airspace,
+                aircraft_types=basis.aircraft_types,
+                ledger=ledger,
+                deconfliction=deconfliction,
+                clock=clock,
+                metrics=metrics,
+                probe=LedgerProbe(ledger),
+            )
         finally:
-            deconfliction.stop()
+            if deconfliction is not None:
+                deconfliction.stop()
 
 
-def of_request(request: Request) -> Service:
-    """Return the service that answers a request."""
+def _writer(
+    basis: Basis,
+    ledger: Ledger,
+    clock: Callable[[], int],
+    metrics: Metrics,
+    on_death: Callable[[], None],
+) -> Deconfliction:
+    settings = basis.settings
+    warm_up()
+    planner = Planner(basis.airspace, settings.search, int(settings.hover_limit_s * 1000))
+    policy = Policy(
+        horizon_ms=int(settings.horizon_days * 86_400_000),
+        idempotency_ms=int(settings.idempotency_hours * 3_600_000),
+        queue_limit=settings.queue_limit,
+        retention_ms=None if settings.retention_days is None else int(settings.retention_days * 86_400_000),
+    )
+    deconfliction = Deconfliction(
+        ledger, planner, basis.performances(), clock, policy, observe=metrics.batch, on_death=on_death
+    )
+    deconfliction.start()
+    metrics.index_loaded(len(planner.index))
+    return deconfliction
+
+
+async def of_request(request: Request) -> Service:
+    """Return the service that answers a request. A coroutine, so that it needs none of the threads of plain routes."""
     return cast(Service, request.state.service)
 
 

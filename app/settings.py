@@ -10,6 +10,8 @@ from planner.cfa_star import Search
 
 # A day: no hover and no ground hold is longer.
 _LONGEST_S = 86_400.0
+# An hour: clocks of servers on one ledger differ by less.
+_SHORTEST_RETENTION_DAYS = 1 / 24
 
 
 class Settings(BaseSettings):
@@ -22,12 +24,16 @@ class Settings(BaseSettings):
     ledger: str = "airmatrix.sqlite"
     airspace: Path | None = None
     aircraft_types: Path | None = None
+    workers: Annotated[int, Field(ge=1, le=64)] = 1
+    read_only: bool = False
 
     search: Search = Search.SAFE_INTERVAL
     hover_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 60.0
     ground_hold_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 300.0
     horizon_days: Annotated[float, Field(gt=0, le=60)] = 30.0
     idempotency_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 24.0
+    # Without it, nothing is ever removed.
+    retention_days: Annotated[float, Field(ge=_SHORTEST_RETENTION_DAYS, le=36_500)] | None = None
 
     queue_limit: Annotated[int, Field(ge=1)] = 1024
     max_body_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024

@@ -22,9 +22,10 @@ class OccupancyIndex:
 
     def __init__(self, block_count: int) -> None:
         self.slabs = intervals.empty_slabs(block_count, pool_size=1 << 12)
+        self._size = 0
 
     def __len__(self) -> int:
-        return int(self.slabs.table[:, intervals.COUNT].sum())
+        return self._size
 
     def reserve(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray, owner: int | IntArray) -> None:
         """Add half-open reservations [enter, exit), disjoint among themselves, of one owner or one each: all or none.
@@ -43,18 +44,24 @@ class OccupancyIndex:
         done = 0
         while (done := intervals.insert(*self.slabs, blocks, enters_ms, exits_ms, owners, done)) < len(blocks):
             self._grow()
+        self._size += len(blocks)
 
     def release(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray) -> int:
         """Remove exactly these reservations where they are present; return how many were."""
-        return int(intervals.remove(*self.slabs, blocks, enters_ms, exits_ms))
+        removed = int(intervals.remove(*self.slabs, blocks, enters_ms, exits_ms))
+        self._size -= removed
+        return removed
 
     def forget_before(self, time_ms: int) -> int:
         """Drop the reservations that end by `time_ms`; return how many."""
-        return int(intervals.forget(*self.slabs, time_ms))
+        dropped = int(intervals.forget(*self.slabs, time_ms))
+        self._size -= dropped
+        return dropped
 
     def clear(self) -> None:
         """Drop everything."""
         self.slabs = intervals.empty_slabs(len(self.slabs.table), len(self.slabs.pool))
+        self._size = 0
 
     def owners(self, block: int, from_ms: int, to_ms: int) -> tuple[int, ...]:
         """Return the owners of a block's reservations that overlap [from, to), in order of time, each once."""

@@ -10,13 +10,12 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from app.client import DEFAULT_URL, Client, ProblemAnswer, grid_of
-from app.commands.terminal import progress_bar, remark, show
-from app.errors import StartupError
+from app.client import DEFAULT_URL, Client, ProblemAnswer
+from app.commands.random_intents import RandomIntents
+from app.commands.terminal import progress_bar, remark, show, spread
 from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody
-from app.times import format_time, now_ms, parse_time
-from planner.airmatrix import AirMatrix
-from planner.experiments.traffic import PAPER_AIRCRAFT, Flight, Od, random_flights, terminals
+from app.times import now_ms, parse_time
+from planner.experiments.traffic import Od
 
 _LONGEST_WINDOW_S = 366 * 86_400.0
 _INTERRUPTED = 130
@@ -51,22 +50,13 @@ def simulate(
         raise typer.BadParameter("expected a number of seconds", param_hint="--window")
     tally = Tally()
     with Client(url) as client:
-        answer = client.airspace()
-        grid = grid_of(answer)
-        occupied = np.zeros(grid.block_count, dtype=np.bool_)
-        occupied[[grid.index(block) for block in client.static_blocks().blocks]] = True
-        places = terminals(grid, occupied, od)
-        if len(places) < 2:
-            raise StartupError("the airspace has fewer than two free blocks to fly between")
-        aircraft = [item.id for item in client.aircraft_types()]
-        aircraft = [id_ for id_ in PAPER_AIRCRAFT if id_ in aircraft] or aircraft
-        wishes = random_flights(places, aircraft, flights, window, seed)
+        demand = RandomIntents.served_by(client, od)
         began = time.perf_counter()
         interrupted = False
         try:
             with progress_bar("flight intents", flights) as advance_to:
-                for number, wish in enumerate(wishes, start=1):
-                    _submit(client, _body(grid, wish, start_ms, operator, f"seed {seed}, flight {number}"), tally)
+                for number, body in enumerate(demand.bodies(flights, start_ms, window, seed, operator), start=1):
+                    _submit(client, FlightIntentBody.model_validate(body), tally)
                     advance_to(number)
         except KeyboardInterrupt:
             interrupted = True
@@ -74,28 +64,9 @@ def simulate(
         finally:
             if tally.latency_ms:
                 seconds = time.perf_counter() - began
-                _print(tally, seconds, f"{answer.name}, {answer.occupancy_rule}, {answer.search}")
+                _print(tally, seconds, demand.title)
     if interrupted:
         raise typer.Exit(_INTERRUPTED)
-
-
-def _body(grid: AirMatrix, flight: Flight, start_ms: int, operator: str, reference: str) -> FlightIntentBody:
-    """Return the request for a flight between the centres of its blocks."""
-    x, y, alt_m = grid.centres(np.array([flight.origin, flight.destination])).T
-    lon, lat = grid.unproject(x, y)
-    origin, destination = (
-        {"lon": float(lon[end]), "lat": float(lat[end]), "alt_m": float(alt_m[end])} for end in (0, 1)
-    )
-    return FlightIntentBody.model_validate(
-        {
-            "operator": operator,
-            "reference": reference,
-            "aircraft_type": flight.aircraft,
-            "origin": origin,
-            "destination": destination,
-            "earliest_departure": format_time(start_ms + flight.departure_ms),
-        }
-    )
 
 
 def _submit(client: Client, body: FlightIntentBody, tally: Tally) -> None:
@@ -123,7 +94,5 @@ def _print(tally: Tally, seconds: float, title: str) -> None:
             column = np.array(values, dtype=np.float64)
             more = f"{np.count_nonzero(column)} flights, sum {column.sum():.1f} s, max {column.max():.1f} s"
             table.add_row(label, f"mean {column.mean():.3f} s, {more}")
-    median, p95, p99 = np.percentile(tally.latency_ms, [50, 95, 99])
-    latency = f"median {median:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms, max {max(tally.latency_ms):.1f} ms"
-    table.add_row("latency", latency)
+    table.add_row("latency", spread(tally.latency_ms))
     show(table)

@@ -1,15 +1,25 @@
 """What commands show: results on stdout, everything else on stderr, all text as it is."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from app.errors import StartupError
+
+
+class Advance(Protocol):
+    """Moves a progress bar to how much is done, with an aside to show beside it."""
+
+    def __call__(self, done: float, aside: str = "") -> None:
+        """Show the progress."""
 
 
 def show(table: Table) -> None:
@@ -23,13 +33,20 @@ def remark(label: str, style: str, message: str) -> None:
 
 
 @contextmanager
-def progress_bar(what: str, total: float) -> Iterator[Callable[[float], None]]:
+def progress_bar(what: str, total: float) -> Iterator[Advance]:
     """Show a bar while the block runs; call what it yields with how much is done."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    aside = TextColumn("{task.fields[aside]}")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), aside)
     console = _console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done: progress.update(task, completed=done)
+        task = progress.add_task(what, total=total, aside="")
+        yield lambda done, aside="": progress.update(task, completed=done, aside=aside)
+
+
+def spread(values_ms: Sequence[float] | NDArray[np.float64]) -> str:
+    """Return how at least one duration, in ms, is distributed."""
+    median, p95, p99, longest = np.percentile(values_ms, [50, 95, 99, 100])
+    return f"median {median:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms, max {longest:.1f} ms"
 
 
 def write(path: Path, content: bytes) -> None:

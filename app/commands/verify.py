@@ -10,7 +10,7 @@ from rich.table import Table
 
 from app.commands.terminal import progress_bar, remark, show
 from app.flight_intents import FlightIntent, Reservations, State
-from app.ledger import open_ledger
+from app.ledger import open_ledger, parse_location
 from app.service import load_airspace
 from app.settings import Settings
 from app.times import format_time
@@ -32,13 +32,14 @@ def verify(
     field = load_airspace(settings)
     with closing(open_ledger(settings.ledger, field)) as book:
         intents, unknown = book.everything()
+        removed_ms = book.removed().before_ms
     flights = [checked(intent) for intent in intents if intent.trajectory is not None or len(intent.reservations)]
     flights += [_flight(f"unknown intent {sequence}", held, None) for sequence, held in unknown.items()]
     with progress_bar("checking", 1.0) as advance_to:
         report = judge(field, flights, lambda _, fraction: advance_to(fraction))
     states = {state: sum(intent.state is state for intent in intents) for state in State}
     strays = [flight.id for flight in flights if len(flight.block) == 0 < len(flight.hold_block)]
-    _print(report, states, strays, f"{settings.ledger}: {field.name}", field.grid)
+    _print(report, states, removed_ms, strays, f"{parse_location(settings.ledger)}: {field.name}", field.grid)
     if strays or not report.ok:
         raise typer.Exit(1)
 
@@ -62,9 +63,18 @@ def _flight(name: str, held: Reservations, trajectory: Trajectory | None) -> Che
     )
 
 
-def _print(report: Report, states: dict[State, int], strays: list[str], title: str, grid: AirMatrix) -> None:
+def _print(
+    report: Report,
+    states: dict[State, int],
+    removed_ms: int | None,
+    strays: list[str],
+    title: str,
+    grid: AirMatrix,
+) -> None:
     table = Table(title=title, show_header=False, title_justify="left")
     table.add_row("flight intents", ", ".join(f"{count} {state}" for state, count in states.items() if count) or "none")
+    if removed_ms is not None:
+        table.add_row("removed by retention", f"flight intents that ended before {format_time(removed_ms)}")
     judged = f"{report.flights - report.released} flights, {report.reservations} reservations"
     table.add_row("judged", judged + (f" ({report.released} released)" if report.released else ""))
     for kind, count in _counts(report).items():

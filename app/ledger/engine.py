@@ -1,64 +1,75 @@
 """Opening a ledger: where it is, whether it is one, which schema it has, whose airspace it belongs to."""
 
 import sqlite3
-import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.resources import files
-from pathlib import Path
+from typing import Protocol
 
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import URL, Connection, Engine, create_engine, event, insert, select
+from sqlalchemy import Connection, Engine, insert, select, update
 from sqlalchemy.exc import DatabaseError
 
-from app.errors import AirspaceMismatch, ForeignLedger, LedgerMissing, LedgerOutdated, StartupError
+from app.errors import AirspaceMismatch, LedgerOutdated, StartupError
 from app.ledger import tables
-from app.ledger.ledger import Ledger
+from app.ledger.ledger import Ledger, cause_of
+from app.ledger.location import Location, parse_location
+from app.ledger.postgresql import PostgresqlDatabase
+from app.ledger.rows import HeldReservations
+from app.ledger.sqlite import SqliteDatabase
 from planner.airspace import Airspace
 
-# "AMTX": marks a SQLite file as a ledger of ours.
-APPLICATION_ID = 0x414D5458
-# In a SQLite header: where it stands whether the database is in WAL mode, and how.
-_WRITE_VERSION, _WAL = 18, 2
-_BUSY_TIMEOUT_S = 10
-# As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
-_READERS = 40
 
+class Database(Protocol):
+    """What differs between the databases that a ledger can be in."""
 
-def sqlite_path(location: str) -> Path:
-    """Return the file of a ledger given as a path or a ``sqlite:///`` URL; `StartupError` for any other URL."""
-    if location.startswith("sqlite:///"):
-        return Path(location.removeprefix("sqlite:///"))
-    if "://" in location:
-        scheme = location.split("://")[0]
-        raise StartupError(f"ledgers on {scheme} are not supported yet; give a file path or a sqlite:/// URL")
-    return Path(location)
+    location: Location
+
+    @property
+    def name(self) -> str:
+        """The database's kind."""
+
+    def create(self) -> None:
+        """Make a place for a ledger where there is none."""
+
+    def check(self) -> None:
+        """Raise `LedgerMissing` or `ForeignLedger` where that shows without a connection."""
+
+    def check_tables(self, connection: Connection, *, may_be_empty: bool) -> None:
+        """Raise `LedgerMissing` or `ForeignLedger` where only a connection shows that."""
+
+    def engine(self, *, writes: bool, migrates: bool = False) -> Engine:
+        """Return an engine whose transactions hold the write lock from the start, or cannot write at all."""
+
+    def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
+        """Insert reservations; the database refuses an overlap."""
 
 
 def create_or_upgrade(location: str) -> str:
     """Create an absent ledger or bring a present one to the newest schema; return that schema's version.
 
-    Raises `ForeignLedger` for a file that is something else, `LedgerOutdated` for one newer than this program.
+    Raises `ForeignLedger` for what is something else, `LedgerOutdated` for a ledger newer than this program.
     """
-    path = sqlite_path(location)
-    if not path.parent.is_dir():
-        raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
-    if not (path.exists() and path.stat().st_size > 0) or _check_is_ledger(path)[_WRITE_VERSION] != _WAL:
-        _mark(path)
-    engine = _engine(path, writes=True)
-    try:
-        with engine.begin() as connection:
-            if _schema(connection, path) != _head():
-                config = _alembic()
-                config.attributes["connection"] = connection
-                command.upgrade(config, "head")
-    except (DatabaseError, sqlite3.Error) as error:
-        raise StartupError(f"cannot create or upgrade ledger {path}: {_cause(error)}") from error
-    finally:
-        engine.dispose()
+    database = _database_at(location)
+    database.create()
+    with _connected(database, writes=True, migrates=True, purpose="create or upgrade") as connection:
+        database.check_tables(connection, may_be_empty=True)
+        if _schema(connection, database.location) != _head():
+            config = _alembic()
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
     return _head()
+
+
+def check_exists(location: str) -> None:
+    """Raise `LedgerMissing` or `ForeignLedger` unless there is a ledger, of whatever schema and airspace."""
+    database = _database_at(location)
+    database.check()
+    with _connected(database, writes=False, purpose="open") as connection:
+        database.check_tables(connection, may_be_empty=False)
 
 
 def open_ledger(location: str, airspace: Airspace, *, claim: bool = False) -> Ledger:
@@ -68,93 +79,61 @@ def open_ledger(location: str, airspace: Airspace, *, claim: bool = False) -> Le
     ------
     LedgerMissing, ForeignLedger, LedgerOutdated, AirspaceMismatch
     """
-    path = sqlite_path(location)
-    if not path.exists():
-        raise LedgerMissing(f"there is no ledger at {path}; `airmatrix serve` creates one")
-    _check_is_ledger(path)
-    engine = _engine(path, writes=claim)
+    database = _database_at(location)
+    place = database.location
+    database.check()
+    with _connected(database, writes=claim, migrates=claim, purpose="open") as connection:
+        database.check_tables(connection, may_be_empty=False)
+        schema = _schema(connection, place)
+        if schema != _head():
+            raise LedgerOutdated(f"ledger {place} has schema {schema}, not {_head()}; run: airmatrix db upgrade")
+        owner = connection.execute(select(tables.airspace)).one_or_none()
+        if owner is not None and owner.fingerprint != airspace.fingerprint:
+            raise AirspaceMismatch(
+                f"ledger {place} belongs to airspace {owner.id!r} ({owner.fingerprint[:12]}), not to "
+                f"{airspace.id!r} ({airspace.fingerprint[:12]}); give that airspace's file, or another ledger"
+            )
+        if owner is None and claim:
+            connection.execute(
+                insert(tables.airspace).values(
+                    only=1, id=airspace.id, name=airspace.name, fingerprint=airspace.fingerprint
+                )
+            )
+        if claim:
+            # A lock can be had on what cannot be written; now is the time to notice.
+            connection.execute(update(tables.counters).values(revision=tables.counters.c.revision))
+    return Ledger(database.engine(writes=True), database.engine(writes=False), database.insert_reservations, airspace)
+
+
+def kind_of(location: str) -> str:
+    """Return which database a ledger is in: `sqlite` or `postgresql`."""
+    return _database_at(location).name
+
+
+def _database_at(location: str) -> Database:
+    place = parse_location(location)
+    return SqliteDatabase(place) if place.is_sqlite else PostgresqlDatabase(place)
+
+
+@contextmanager
+def _connected(database: Database, *, writes: bool, migrates: bool = False, purpose: str) -> Iterator[Connection]:
+    """Open one transaction; what the database refuses in it is a `StartupError`."""
+    engine = database.engine(writes=writes, migrates=migrates)
     try:
         with engine.begin() as connection:
-            schema = _schema(connection, path)
-            if schema != _head():
-                raise LedgerOutdated(f"ledger {path} has schema {schema}, not {_head()}; run: airmatrix db upgrade")
-            owner = connection.execute(select(tables.airspace)).one_or_none()
-            if owner is not None and owner.fingerprint != airspace.fingerprint:
-                raise AirspaceMismatch(
-                    f"ledger {path} belongs to airspace {owner.id!r} ({owner.fingerprint[:12]}), not to "
-                    f"{airspace.id!r} ({airspace.fingerprint[:12]}); give that airspace's file, or another ledger"
-                )
-            if owner is None and claim:
-                connection.execute(
-                    insert(tables.airspace).values(
-                        only=1, id=airspace.id, name=airspace.name, fingerprint=airspace.fingerprint
-                    )
-                )
-    except DatabaseError as error:
-        raise StartupError(f"cannot open ledger {path}: {_cause(error)}") from error
+            yield connection
+    except (DatabaseError, sqlite3.Error) as error:
+        raise StartupError(f"cannot {purpose} ledger {database.location}: {cause_of(error)}") from error
     finally:
         engine.dispose()
-    return Ledger(_engine(path, writes=True), _engine(path, writes=False), airspace)
 
 
-def _engine(path: Path, *, writes: bool) -> Engine:
-    """Return an engine whose transactions hold the write lock from the start, or cannot write at all."""
-    engine = create_engine(
-        URL.create("sqlite", database=str(path)),
-        pool_size=1 if writes else _READERS,
-        max_overflow=0,
-        connect_args={"timeout": _BUSY_TIMEOUT_S, "check_same_thread": False, "isolation_level": None},
-    )
-
-    @event.listens_for(engine, "connect")
-    def configure(connection: sqlite3.Connection, _record: object) -> None:
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
-
-    @event.listens_for(engine, "begin")
-    def begin(connection: Connection) -> None:
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
-
-    return engine
-
-
-def _mark(path: Path) -> None:
-    """Make an empty file a ledger; the mark comes first, so that one whose creation was cut short is still one."""
-    give_up = time.monotonic() + _BUSY_TIMEOUT_S
-    while True:
-        try:
-            with closing(sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S, isolation_level=None)) as connection:
-                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                connection.execute("PRAGMA journal_mode = WAL")
-                return
-        except sqlite3.Error as error:
-            # SQLite does not wait for others by itself when it changes the journal mode.
-            if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
-                raise StartupError(f"cannot create ledger {path}: {error}") from error
-        time.sleep(0.01)
-
-
-def _check_is_ledger(path: Path) -> bytes:
-    """Return the file's header, read without SQLite, which may write beside a database that it merely opens."""
-    try:
-        with path.open("rb") as file:
-            header = file.read(100)
-    except OSError as error:
-        raise ForeignLedger(f"cannot read ledger {path}: {error.strerror}") from error
-    if not header.startswith(b"SQLite format 3\0"):
-        raise ForeignLedger(f"{path} is not an AirMatrix ledger; nothing was changed in it")
-    if int.from_bytes(header[68:72]) != APPLICATION_ID:
-        raise ForeignLedger(f"{path} is a SQLite database, but not an AirMatrix ledger; nothing was changed in it")
-    return header
-
-
-def _schema(connection: Connection, path: Path) -> str | None:
+def _schema(connection: Connection, location: Location) -> str | None:
     """Return the ledger's schema version; `LedgerOutdated` if this program does not know it."""
     schema = MigrationContext.configure(connection).get_current_revision()
     known = {script.revision for script in ScriptDirectory.from_config(_alembic()).walk_revisions()}
     if schema is not None and schema not in known:
-        raise LedgerOutdated(f"ledger {path} has schema {schema}, newer than this program's {_head()}")
+        raise LedgerOutdated(f"ledger {location} has schema {schema}, newer than this program's {_head()}")
     return schema
 
 
@@ -169,7 +148,3 @@ def _head() -> str:
     head = ScriptDirectory.from_config(_alembic()).get_current_head()
     assert head is not None
     return head
-
-
-def _cause(error: BaseException) -> BaseException:
-    return getattr(error, "orig", None) or error

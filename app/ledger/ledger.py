@@ -5,9 +5,12 @@ sees everything committed before it, so `sequence` and `revision` are gapless an
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import takewhile
+from typing import Any
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Engine, and_, case, delete, func, insert, select, update
@@ -15,7 +18,7 @@ from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
-from app.ledger.rows import HeldReservations, by_intent, columns_of, dump_columns, to_held, to_intent, to_row
+from app.ledger.rows import HeldReservations, by_intent, columns_of, dump_columns, joined, to_held, to_intent, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
@@ -25,8 +28,11 @@ from planner.path import Trajectory
 _BOUND_AT_ONCE = 10_000
 
 
-class ReservationOverlap(Exception):
-    """The database refused a reservation because it overlaps another: the caller's picture of the ledger was wrong."""
+InsertReservations = Callable[[Connection, HeldReservations], None]
+
+
+class ConstraintViolated(Exception):
+    """The database refused rows, such as an overlapping reservation: the caller's picture of the ledger was wrong."""
 
 
 class CommitUncertain(Exception):
@@ -54,12 +60,23 @@ class IdempotencyRecord:
     answer: bytes
 
 
+@dataclass(frozen=True)
+class Removed:
+    """What retention has removed: flights that ended before a time (None: none), journal entries up to a revision."""
+
+    before_ms: int | None
+    journal_through: int
+
+
 class Ledger:
     """One ledger: `transaction()` to write, everything else to read."""
 
-    def __init__(self, writer: Engine, reader: Engine, airspace: Airspace) -> None:
+    def __init__(
+        self, writer: Engine, reader: Engine, insert_reservations: InsertReservations, airspace: Airspace
+    ) -> None:
         self._writer = writer
         self._reader = reader
+        self._insert_reservations = insert_reservations
         self._airspace = airspace
 
     def close(self) -> None:
@@ -75,35 +92,49 @@ class Ledger:
         ------
         LedgerUnavailable
             A statement failed: nothing was written.
+        ConstraintViolated
+            The database refused rows: nothing was written.
         CommitUncertain
             The COMMIT itself failed: something may have been written.
         """
         try:
             connection = self._writer.connect()
         except DBAPIError as error:
-            raise LedgerUnavailable(f"the ledger cannot be opened: {error.orig}") from error
+            raise LedgerUnavailable(f"the ledger cannot be opened: {cause_of(error)}") from error
         try:
             try:
                 connection.begin()
-                transaction = Transaction(connection, self._airspace)
+                transaction = Transaction(connection, self._airspace, self._insert_reservations)
                 yield transaction
-                transaction.write_counters()
+                transaction.flush()
             except DBAPIError as error:
                 connection.invalidate()
-                raise LedgerUnavailable(f"the ledger cannot be written: {error.orig}") from error
+                raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
             except LedgerUnavailable:
                 connection.invalidate()
                 raise
             except BaseException:
                 connection.rollback()
                 raise
+            began = time.perf_counter()
             try:
                 connection.commit()
             except DBAPIError as error:
                 connection.invalidate()
-                raise CommitUncertain(str(error.orig)) from error
+                raise CommitUncertain(cause_of(error)) from error
+            transaction.commit_s = time.perf_counter() - began
         finally:
             connection.close()
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the write lock, write nothing: whatever was being written before has happened by now, or never will."""
+        try:
+            with self._writer.connect() as connection:
+                connection.begin()
+                yield
+        except DBAPIError as error:
+            raise LedgerUnavailable(f"the ledger cannot be locked: {cause_of(error)}") from error
 
     @contextmanager
     def _reading(self) -> Iterator[Connection]:
@@ -111,12 +142,18 @@ class Ledger:
             with self._reader.begin() as connection:
                 yield connection
         except DBAPIError as error:
-            raise LedgerUnavailable(f"the ledger cannot be read: {error.orig}") from error
+            raise LedgerUnavailable(f"the ledger cannot be read: {cause_of(error)}") from error
 
     def revision(self) -> int:
         """Return the newest revision."""
         with self._reading() as connection:
             return int(connection.execute(select(counters.c.revision)).scalar_one())
+
+    def removed(self) -> "Removed":
+        """Return what retention has removed."""
+        with self._reading() as connection:
+            row = connection.execute(select(counters.c.removed_before, counters.c.journal_removed)).one()
+        return Removed(row.removed_before or None, row.journal_removed)
 
     def find(self, intent_id: str) -> FlightIntent | None:
         """Return an intent with its reservations, None if there is none."""
@@ -203,37 +240,52 @@ class Ledger:
 
 
 class Transaction:
-    """Work on the ledger under the write lock."""
+    """Work on the ledger under the write lock.
 
-    def __init__(self, connection: Connection, airspace: Airspace) -> None:
+    New rows wait in memory until `flush`, which writes those of many intents at once; what reads them sees them.
+    """
+
+    def __init__(self, connection: Connection, airspace: Airspace, insert_reservations: InsertReservations) -> None:
         self._connection = connection
         self._airspace = airspace
-        self._sequence, self.revision, self._longest_flight_ms = connection.execute(
-            select(counters.c.sequence, counters.c.revision, counters.c.longest_flight)
-        ).one()
-        self._begun_at = self.revision
+        self._insert_reservations = insert_reservations
+        self._counters = self._written = _Counters(*connection.execute(select(*_COUNTERS)).one())
+        self._forget_pending()
+        self._answers_forgotten_ms: int | None = None
+        self.write_s = 0.0
+        self.commit_s = 0.0
+
+    @property
+    def revision(self) -> int:
+        """The newest revision, with what this transaction has added."""
+        return self._counters.revision
+
+    @property
+    def journal_removed(self) -> int:
+        """The revision up to which the journal has been removed."""
+        return self._counters.journal_removed
 
     @contextmanager
     def savepoint(self) -> Iterator[None]:
-        """Undo what happens inside if the database refuses it.
+        """Write what happens inside, or undo it.
 
         Raises
         ------
-        ReservationOverlap
+        ConstraintViolated
         LedgerUnavailable
             Any other failure of the database: the whole transaction is lost.
         """
-        before = self._sequence, self.revision, self._longest_flight_ms
+        self.flush()
+        before = self._counters
         try:
             with self._connection.begin_nested():
                 yield
-        except IntegrityError as error:
-            self._sequence, self.revision, self._longest_flight_ms = before
-            raise ReservationOverlap(str(error.orig)) from error
+                self.flush()
         except DBAPIError as error:
-            raise LedgerUnavailable(f"the ledger cannot be written: {error.orig}") from error
+            raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
         except BaseException:
-            self._sequence, self.revision, self._longest_flight_ms = before
+            self._counters = self._written = before
+            self._forget_pending()
             raise
 
     def record(
@@ -246,16 +298,19 @@ class Transaction:
         reservations: Reservations | None = None,
         refusal: Refusal | None = None,
     ) -> FlightIntent:
-        """Insert an intent, accepted with its reservations or rejected, under the next sequence number."""
+        """Add an intent, accepted with its reservations or rejected, under the next sequence number."""
         state = State.REJECTED if trajectory is None else State.ACCEPTED
-        if trajectory is not None:
-            flight_ms = trajectory.flight_time_ms
-            self._longest_flight_ms = max(self._longest_flight_ms, flight_ms)
-        self._advance(sequence=True)
+        counters = self._counters
+        self._counters = replace(
+            counters,
+            sequence=counters.sequence + 1,
+            longest_flight=max(counters.longest_flight, 0 if trajectory is None else trajectory.flight_time_ms),
+        )
+        revision = self._append(self._counters.sequence, intent_id, now_ms, state, released=None)
         intent = FlightIntent(
             id=intent_id,
-            sequence=self._sequence,
-            version=self.revision,
+            sequence=self._counters.sequence,
+            version=revision,
             state=state,
             submission=submission,
             received_ms=now_ms,
@@ -263,33 +318,34 @@ class Transaction:
             reservations=reservations or Reservations.none(),
             refusal=refusal,
         )
-        self._connection.execute(insert(flight_intents), to_row(intent))
-        self._reserve(intent.sequence, intent.reservations)
-        self._append(intent, now_ms, state.value, released=None)
+        self._new_intents[intent_id] = intent
         return intent
 
     def release(self, intent: FlightIntent, state: State, now_ms: int, keep: bool) -> FlightIntent:
         """Move an intent to another state; unless `keep`, delete its reservations."""
-        self._advance(sequence=False)
+        self.flush()
         released = None if keep else intent.reservations
         if released is not None:
             self._connection.execute(delete(reservations).where(reservations.c.intent == intent.sequence))
-        changed = intent.changed(self.revision, state, intent.reservations if keep else Reservations.none())
+        revision = self._append(intent.sequence, intent.id, now_ms, state, released)
         self._connection.execute(
             update(flight_intents)
             .where(flight_intents.c.sequence == intent.sequence)
-            .values(state=state.value, version=self.revision)
+            .values(state=state.value, version=revision)
         )
-        self._append(changed, now_ms, state.value, released)
-        return changed
+        return intent.changed(revision, state, intent.reservations if keep else Reservations.none())
 
     def find(self, intent_id: str) -> FlightIntent | None:
         """Return an intent with its reservations, None if there is none."""
+        if intent_id in self._new_intents:
+            self.flush()
         return _find(self._connection, self._airspace, intent_id)
 
     def ids(self, sequences: Iterable[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
-        return _ids(self._connection, sequences)
+        wanted = set(sequences)
+        new = {intent.sequence: id_ for id_, intent in self._new_intents.items() if intent.sequence in wanted}
+        return new | (_ids(self._connection, wanted - new.keys()) if wanted - new.keys() else {})
 
     def journal_after(self, revision: int) -> list[JournalEntry]:
         """Return all journal entries after a revision, oldest first."""
@@ -297,6 +353,7 @@ class Transaction:
 
     def held_after(self, time_ms: int, sequences: Sequence[int] | None = None) -> HeldReservations:
         """Return the reservations that end after a time, of all intents or of some, by intent."""
+        self.flush()
         query = select(reservations).where(reservations.c.exit > time_ms)
         if sequences is not None:
             query = query.where(reservations.c.intent.in_(sequences))
@@ -304,56 +361,132 @@ class Transaction:
 
     def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
         """Return the first answer to an idempotency key, None if it is new."""
+        new = self._new_answers.get((operator, key))
+        if new is not None:
+            return new
         return _answer_to(self._connection, self._airspace, operator, key)
 
     def remember_answer(
         self, operator: str, key: str, body_digest: str, intent: FlightIntent, answer: bytes, now_ms: int
     ) -> None:
         """Keep the first answer to an idempotency key."""
-        self._connection.execute(
-            insert(idempotency_keys).values(
-                operator=operator, key=key, body_digest=body_digest,
-                intent=intent.sequence, answer=answer.decode(), created=now_ms,
-            )
+        self._new_answers[operator, key] = IdempotencyRecord(body_digest, intent, answer)
+        self._new_keys.append(
+            {
+                "operator": operator, "key": key, "body_digest": body_digest,
+                "intent": intent.sequence, "answer": answer.decode(), "created": now_ms,
+            }
         )  # fmt: skip
 
     def forget_answers(self, before_ms: int) -> None:
-        """Drop idempotency keys first used before a time."""
+        """Drop idempotency keys first used before a time; asked for the same again in a transaction, do nothing."""
+        if before_ms == self._answers_forgotten_ms:
+            return
+        self._answers_forgotten_ms = before_ms
         self._connection.execute(delete(idempotency_keys).where(idempotency_keys.c.created < before_ms))
 
-    def write_counters(self) -> None:
-        """Write down how far the counters have come: once, before the commit, and not where nothing has changed."""
-        if self.revision == self._begun_at:
+    def remove_ended(self, before_ms: int, limit: int) -> int:
+        """Remove up to `limit` intents that ended before a time, with all they held; return how many.
+
+        An intent stays while an idempotency key needs it.
+        """
+        self.flush()
+        ends = func.coalesce(flight_intents.c.arrival, flight_intents.c.latest_departure)
+        has_key = select(idempotency_keys.c.key).where(idempotency_keys.c.intent == flight_intents.c.sequence).exists()
+        query = select(flight_intents.c.sequence).where(ends < before_ms, ~has_key).order_by(ends).limit(limit)
+        sequences = list(self._connection.execute(query).scalars())
+        if sequences:
+            self._connection.execute(delete(reservations).where(reservations.c.intent.in_(sequences)))
+            self._connection.execute(delete(flight_intents).where(flight_intents.c.sequence.in_(sequences)))
+            removed_before = max(self._counters.removed_before, before_ms)
+            self._counters = replace(self._counters, removed_before=removed_before)
+        return len(sequences)
+
+    def remove_journal(self, before_ms: int, limit: int) -> int:
+        """Remove up to `limit` of the oldest journal entries, if they are from before a time; return how many."""
+        self.flush()
+        query = select(journal.c.revision, journal.c.time).order_by(journal.c.revision).limit(limit)
+        old = list(takewhile(lambda row: row.time < before_ms, self._connection.execute(query).all()))
+        # The newest entry stays: its time tells how far the ledger's own time has come.
+        if old and old[-1].revision == self.revision:
+            old.pop()
+        if old:
+            self._counters = replace(self._counters, journal_removed=old[-1].revision)
+            self.flush()
+            self._connection.execute(delete(journal).where(journal.c.revision <= old[-1].revision))
+        return len(old)
+
+    def newest_journal_time(self) -> int | None:
+        """Return when the newest change was recorded, None if there has been none."""
+        self.flush()
+        query = select(journal.c.time).order_by(journal.c.revision.desc()).limit(1)
+        return self._connection.execute(query).scalar_one_or_none()
+
+    def touch(self) -> None:
+        """Write something that changes nothing: a commit that succeeds proves that the ledger can be written."""
+        self._connection.execute(update(counters).values(revision=counters.c.revision))
+
+    def flush(self) -> None:
+        """Write the rows that wait, and how far the counters have come; raises `ConstraintViolated`."""
+        if self._counters == self._written:
             return
-        self._connection.execute(
-            update(counters).values(
-                sequence=self._sequence, revision=self.revision, longest_flight=self._longest_flight_ms
-            )
+        began = time.perf_counter()
+        intents = list(self._new_intents.values())
+        try:
+            if intents:
+                self._connection.execute(insert(flight_intents), [to_row(intent) for intent in intents])
+            if any(len(intent.reservations) for intent in intents):
+                self._insert_reservations(self._connection, joined(intents))
+            if self._new_entries:
+                self._connection.execute(insert(journal), self._new_entries)
+            if self._new_keys:
+                self._connection.execute(insert(idempotency_keys), self._new_keys)
+            self._connection.execute(update(counters).values(asdict(self._counters)))
+        except IntegrityError as error:
+            raise ConstraintViolated(cause_of(error)) from error
+        self._written = self._counters
+        self._forget_pending()
+        self.write_s += time.perf_counter() - began
+
+    def _forget_pending(self) -> None:
+        self._new_intents: dict[str, FlightIntent] = {}
+        self._new_entries: list[dict[str, Any]] = []
+        self._new_keys: list[dict[str, Any]] = []
+        self._new_answers: dict[tuple[str, str], IdempotencyRecord] = {}
+
+    def _append(self, sequence: int, intent_id: str, now_ms: int, kind: State, released: Reservations | None) -> int:
+        """Add a journal entry under the next revision, and return that."""
+        self._counters = replace(self._counters, revision=self._counters.revision + 1)
+        self._new_entries.append(
+            {
+                "revision": self.revision,
+                "time": now_ms,
+                "kind": kind.value,
+                "intent": sequence,
+                "flight_intent_id": intent_id,
+                "released": None if released is None else dump_columns(*columns_of(released)),
+            }
         )
+        return self.revision
 
-    def _advance(self, *, sequence: bool) -> None:
-        self._sequence += sequence
-        self.revision += 1
 
-    def _append(self, intent: FlightIntent, now_ms: int, kind: str, released: Reservations | None) -> None:
-        self._connection.execute(
-            insert(journal).values(
-                revision=self.revision,
-                time=now_ms,
-                kind=kind,
-                intent=intent.sequence,
-                released=None if released is None else dump_columns(*columns_of(released)),
-            )
-        )
+@dataclass(frozen=True)
+class _Counters:
+    """The one row of `counters`."""
 
-    def _reserve(self, sequence: int, held: Reservations) -> None:
-        """Insert reservations: the only place that does. By driver, since a hundred rows an intent are the hot path."""
-        if len(held):
-            block, enter, leave = (column.tolist() for column in columns_of(held))
-            rows = list(zip(block, enter, leave, [sequence] * len(block), strict=True))
-            self._connection.exec_driver_sql(
-                'INSERT INTO reservations (block, enter, "exit", intent) VALUES (?, ?, ?, ?)', rows
-            )
+    sequence: int
+    revision: int
+    longest_flight: int
+    removed_before: int
+    journal_removed: int
+
+
+_COUNTERS = [counters.c[field.name] for field in fields(_Counters)]
+
+
+def cause_of(error: BaseException) -> str:
+    """Return what a database says in one line."""
+    return " ".join(str(getattr(error, "orig", None) or error).split())
 
 
 def _find(connection: Connection, airspace: Airspace, intent_id: str) -> FlightIntent | None:
@@ -404,19 +537,13 @@ def _ids(connection: Connection, sequences: Iterable[int]) -> dict[int, str]:
 
 
 def _journal_after(connection: Connection, revision: int, limit: int | None) -> list[JournalEntry]:
-    query = (
-        select(journal, flight_intents.c.id)
-        .join(flight_intents, flight_intents.c.sequence == journal.c.intent)
-        .where(journal.c.revision > revision)
-        .order_by(journal.c.revision)
-        .limit(limit)
-    )
+    query = select(journal).where(journal.c.revision > revision).order_by(journal.c.revision).limit(limit)
     return [
         JournalEntry(
             row.revision,
             row.time,
             row.kind,
-            row.id,
+            row.flight_intent_id,
             row.intent,
             np.array(json.loads(row.released or "[]"), dtype=np.int64).reshape(-1, 3),
         )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import orjson
-from sqlalchemy import Result, Row
+from sqlalchemy import CursorResult, Row
 
 from app.errors import LedgerDamaged
 from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission
@@ -97,14 +97,26 @@ def _parsed(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightInte
     )
 
 
-def to_held(result: Result[Any]) -> HeldReservations:
-    """Return rows of `reservations` as columns, read in parts: there may be millions."""
-    parts = [
-        np.fromiter(chain.from_iterable(part), dtype=np.int64, count=4 * len(part)).reshape(-1, 4)
-        for part in result.partitions(_ROWS_AT_ONCE)
-    ]
-    columns = np.concatenate([np.empty((0, 4), dtype=np.int64), *parts])
+def to_held(result: CursorResult[Any]) -> HeldReservations:
+    """Return rows of `reservations` as columns, in parts and past SQLAlchemy's rows: there may be millions."""
+    parts = [np.empty(0, dtype=np.int64)]
+    while rows := result.cursor.fetchmany(_ROWS_AT_ONCE):
+        parts.append(np.fromiter(chain.from_iterable(rows), dtype=np.int64, count=4 * len(rows)))
+    result.close()
+    columns = np.concatenate(parts).reshape(-1, 4)
     return HeldReservations(columns[:, 0], columns[:, 1], columns[:, 2], columns[:, 3])
+
+
+def joined(intents: Sequence[FlightIntent]) -> HeldReservations:
+    """Return the reservations of one or more intents as columns."""
+    held = [intent.reservations for intent in intents]
+    sequences = np.array([intent.sequence for intent in intents], dtype=np.int64)
+    return HeldReservations(
+        np.concatenate([each.block for each in held]),
+        np.concatenate([each.enter_ms for each in held]),
+        np.concatenate([each.exit_ms for each in held]),
+        np.repeat(sequences, [len(each) for each in held]),
+    )
 
 
 def by_intent(held: HeldReservations, sequences: Sequence[int], grid: AirMatrix) -> dict[int, Reservations]:

@@ -20,6 +20,8 @@ counters = Table(
     Column("sequence", BigInteger),
     Column("revision", BigInteger),
     Column("longest_flight", BigInteger),
+    Column("removed_before", BigInteger),
+    Column("journal_removed", BigInteger),
 )
 
 # Times are ms since the epoch; `origin` and `destination` JSON objects of lon, lat, alt_m; `trajectory` a JSON list of
@@ -66,6 +68,7 @@ journal = Table(
     Column("time", BigInteger),
     Column("kind", Text),
     Column("intent", BigInteger),
+    Column("flight_intent_id", Text),
     Column("released", Text),
 )
 

@@ -26,6 +26,9 @@ _DEFAULT_SPAN_MS = 3_600_000
 
 Layer = Annotated[int | None, Query(ge=0, description="Layer k, zero-based; all layers by default.")]
 Index = Annotated[int, Path(ge=0)]
+RemovedBefore = Annotated[
+    Moment | None, Field(description="Flights that ended before this may have been removed; null: none has been.")
+]
 
 
 class Origin(BaseModel):
@@ -97,6 +100,7 @@ class StatusAnswer(BaseModel):
     """The blocks in use at one time; blocks that are not listed are idle."""
 
     at: Moment
+    removed_before: RemovedBefore
     counts: dict[Status, int]
     blocks: list[BlockStatusAnswer]
 
@@ -128,6 +132,7 @@ class BlockAnswer(BaseModel):
     statically_occupied: bool
     status: Literal["idle"] | Status
     reasons: list[str]
+    removed_before: RemovedBefore
     schedule: list[ScheduleEntry]
 
 
@@ -143,6 +148,7 @@ class OccupancyAnswer(BaseModel):
 
     from_: Annotated[Moment, Field(alias="from")]
     to: Moment
+    removed_before: RemovedBefore
     blocks: list[BlockUse]
 
 
@@ -249,9 +255,15 @@ def read_status(
                 for entry, block in zip(shown, blocks, strict=True)
             ],
             at=format_time(at_ms),
+            removed_before=_removed_before(service),
         )
     counts = {color.value: sum(entry.status is color for entry in shown) for color in Status}
-    content = {"at": format_time(at_ms), "counts": counts, "blocks": blocks}
+    content = {
+        "at": format_time(at_ms),
+        "removed_before": _removed_before(service),
+        "counts": counts,
+        "blocks": blocks,
+    }
     return Response(orjson.dumps(content), media_type="application/json")
 
 
@@ -295,6 +307,7 @@ def read_block(
         statically_occupied=bool(service.airspace.occupied[block]),
         status=present[0].status if present else "idle",
         reasons=list(present[0].reasons) if present else [],
+        removed_before=service.ledger.removed().before_ms,
         schedule=[
             ScheduleEntry(flight_intent_id=ids[sequence], enter=enter, exit=leave)
             for sequence, enter, leave in zip(
@@ -328,6 +341,7 @@ def read_occupancy(
     content = {
         "from": format_time(from_ms),
         "to": format_time(to_ms),
+        "removed_before": _removed_before(service),
         "blocks": [{"block": ijk, "seconds": use} for ijk, use in zip(indices.tolist(), seconds.tolist(), strict=True)],
     }
     return Response(orjson.dumps(content), media_type="application/json")
@@ -395,5 +409,10 @@ def _height(grid: AirMatrix, entry: BlockStatus) -> dict[str, float]:
     return {"base_m": grid.block(entry.block)[2] * grid.block_height_m, "height_m": grid.block_height_m}
 
 
-def _geojson(features: Sequence[dict[str, Any]], **members: str) -> Response:
+def _removed_before(service: Service) -> str | None:
+    before_ms = service.ledger.removed().before_ms
+    return None if before_ms is None else format_time(before_ms)
+
+
+def _geojson(features: Sequence[dict[str, Any]], **members: str | None) -> Response:
     return Response(orjson.dumps({"type": "FeatureCollection", **members, "features": features}), media_type=GEOJSON)

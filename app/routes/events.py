@@ -24,10 +24,14 @@ class Event(BaseModel):
 
 
 class EventPage(BaseModel):
-    """A page of events; `next_cursor` is the `after` of the next, null when there is nothing more yet."""
+    """A page of events; `next_cursor` is the `after` of the next, null when there is nothing more yet.
+
+    Events up to the revision `removed_through` have been removed; 0: none has been.
+    """
 
     items: list[Event]
     next_cursor: str | None
+    removed_through: int
 
 
 @router.get("", responses=problems.documented(422, 503), summary="Read the journal")
@@ -49,4 +53,8 @@ def list_events(
         )
         for entry in entries[:limit]
     ]
-    return EventPage(items=items, next_cursor=str(items[-1].revision) if len(entries) > limit else None)
+    return EventPage(
+        items=items,
+        next_cursor=str(items[-1].revision) if len(entries) > limit else None,
+        removed_through=service.ledger.removed().journal_through,
+    )

@@ -1,6 +1,7 @@
 """Flight intents: submit, preview, read, list, cancel."""
 
 import hashlib
+import time
 from typing import Annotated, Any
 
 import numpy as np
@@ -170,7 +171,8 @@ async def submit(
     if idempotency_key is not None:
         digest = hashlib.sha256(orjson.dumps(body.model_dump(), option=orjson.OPT_SORT_KEYS)).hexdigest()
         key = IdempotencyKey(idempotency_key, digest, lambda outcome: _outcome_body(service, outcome))
-    return _outcome_response(service, await service.deconfliction.submit(submission, key))
+    outcome = await service.writer.submit(submission, key)
+    return _outcome_response(service, outcome)
 
 
 @router.post(
@@ -181,7 +183,7 @@ async def submit(
 )
 async def preview(service: ServiceDep, body: FlightIntentBody) -> Response:
     """Answer what submitting this body would give at this moment; nothing is reserved or recorded."""
-    plan = await service.deconfliction.preview(_located(service, body))
+    plan = await service.writer.preview(_located(service, body))
     if isinstance(plan, Refusal):
         return Response(problems.refusal_body(plan), problems.KINDS[NoPlan].status, media_type=problems.MEDIA_TYPE)
     answer = _planned(service.airspace.grid, "preview", plan.submission, plan.trajectory, plan.reservations)
@@ -226,7 +228,9 @@ def read(service: ServiceDep, intent_id: str) -> Response:
     """Return an intent with the reservations it still holds."""
     intent = service.ledger.find(intent_id)
     if intent is None:
-        raise UnknownFlightIntent(f"there is no flight intent {intent_id}")
+        removed_ms = service.ledger.removed().before_ms
+        hint = "" if removed_ms is None else f"; those that ended before {format_time(removed_ms)} have been removed"
+        raise UnknownFlightIntent(f"there is no flight intent {intent_id}{hint}")
     return _intent_response(service, intent)
 
 
@@ -238,7 +242,7 @@ def read(service: ServiceDep, intent_id: str) -> Response:
 )
 async def cancel(service: ServiceDep, intent_id: str) -> Response:
     """Cancel an intent. Before departure its blocks are free at once; a departed flight keeps them until arrival."""
-    return _intent_response(service, await service.deconfliction.cancel(intent_id))
+    return _intent_response(service, await service.writer.cancel(intent_id))
 
 
 def render(grid: AirMatrix, intent: FlightIntent) -> dict[str, Any]:
@@ -273,7 +277,7 @@ def _located(service: Service, body: FlightIntentBody) -> Submission:
     airspace = service.airspace
     origin_block = airspace.free_block_at(origin.lon, origin.lat, origin.alt_m, OriginBlocked)
     destination_block = airspace.free_block_at(destination.lon, destination.lat, destination.alt_m, DestinationBlocked)
-    service.deconfliction.check(origin_block, destination_block)
+    service.writer.check(origin_block, destination_block)
     latest_ms = body.latest_departure
     if latest_ms is None:
         latest_ms = body.earliest_departure + int(service.settings.ground_hold_s * 1000)
@@ -357,9 +361,18 @@ def _outcome_body(service: Service, outcome: Outcome) -> bytes:
 
 
 def _outcome_response(service: Service, outcome: Outcome) -> Response:
-    intent = outcome.intent
-    content = outcome.replayed or _outcome_body(service, outcome)
-    headers = {} if outcome.replayed is None else {"Idempotent-Replayed": "true"}
+    intent, timing = outcome.intent, outcome.timing
+    began = time.perf_counter()
+    content = outcome.replayed or outcome.rendered or _outcome_body(service, outcome)
+    spans = {
+        "queue": timing.queue_s,
+        "plan": timing.plan_s,
+        "commit": timing.commit_s,
+        "serialise": time.perf_counter() - began,
+    }
+    headers = {"Server-Timing": ", ".join(f"{name};dur={seconds * 1000:.3f}" for name, seconds in spans.items())}
+    if outcome.replayed is not None:
+        headers["Idempotent-Replayed"] = "true"
     if intent.refusal is not None:
         return Response(content, problems.KINDS[NoPlan].status, headers, problems.MEDIA_TYPE)
     version = intent.version if outcome.replayed is None else orjson.loads(outcome.replayed)["version"]

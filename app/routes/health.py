@@ -2,15 +2,23 @@
 
 import platform
 from importlib.metadata import version
+from typing import Literal
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter
 from pydantic import BaseModel
 
 from app import problems
-from app.errors import LedgerUnavailable
-from app.service import ServiceDep
+from app.deconfliction import Deconfliction
+from app.errors import LedgerUnavailable, NotReady
+from app.ledger import parse_location
+from app.service import Service, ServiceDep
 
 router = APIRouter(tags=["running it"])
+
+Mode = Literal["read-write", "read-only"]
+
+# Batches take a fraction of a second, and whoever waits for another writer's lock gives up after as long as this.
+_LONGEST_WAIT_S = 10.0
 
 
 class Liveness(BaseModel):
@@ -20,12 +28,12 @@ class Liveness(BaseModel):
 
 
 class Readiness(BaseModel):
-    """Whether requests can be served; `reason` says why not."""
+    """Requests can be served, or only reads; `revision` is the ledger's newest."""
 
-    status: str
-    revision: int | None = None
+    status: str = "ready"
+    mode: Mode
+    revision: int
     waiting: int
-    reason: str | None = None
 
 
 class Version(BaseModel):
@@ -34,6 +42,8 @@ class Version(BaseModel):
     airmatrix: str
     python: str
     airspace: str
+    ledger: Literal["sqlite", "postgresql"]
+    mode: Mode
     authentication: str
     allow_unauthenticated: bool
 
@@ -44,28 +54,52 @@ async def live() -> Liveness:
     return Liveness()
 
 
-@router.get("/health/ready", responses={503: {"model": Readiness}, **problems.documented()}, summary="Readiness")
-def ready(service: ServiceDep, response: Response) -> Readiness:
-    """Answer 200 when the ledger can be read and the writer runs, otherwise 503 with the reason."""
-    waiting = service.deconfliction.waiting
+@router.get("/health/ready", responses=problems.documented(503), summary="Readiness")
+async def ready(service: ServiceDep) -> Readiness:
+    """Answer 200 when the ledger can be read and, unless this process only reads, written; 503 with `reason` if not.
+
+    The answer comes within two seconds, whatever the ledger does.
+    """
+    writer = service.deconfliction
+    reasons = [] if writer is None else _troubles_of(writer)
+    revision = None
     try:
-        revision = service.ledger.revision()
+        revision = await service.probe.revision()
     except LedgerUnavailable as error:
-        response.status_code = 503
-        return Readiness(status="not ready", waiting=waiting, reason=str(error))
-    if not service.deconfliction.is_running:
-        response.status_code = 503
-        return Readiness(status="not ready", waiting=waiting, reason="the ledger writer has stopped")
-    return Readiness(status="ready", revision=revision, waiting=waiting)
+        reasons.append(str(error))
+    waiting = 0 if writer is None else writer.waiting
+    if revision is None or reasons:
+        raise NotReady("; ".join(reasons), waiting, revision)
+    return Readiness(mode=_mode(service), revision=revision, waiting=waiting)
 
 
 @router.get("/version", responses=problems.documented(), summary="Version")
-def read_version(service: ServiceDep) -> Version:
+async def read_version(service: ServiceDep) -> Version:
     """Return versions, and whether anybody may do anything."""
     return Version(
         airmatrix=version("airmatrix"),
         python=platform.python_version(),
         airspace=service.airspace.id,
+        ledger="sqlite" if parse_location(service.settings.ledger).is_sqlite else "postgresql",
+        mode=_mode(service),
         authentication="off",
         allow_unauthenticated=service.settings.allow_unauthenticated,
     )
+
+
+def _mode(service: Service) -> Mode:
+    return "read-only" if service.deconfliction is None else "read-write"
+
+
+def _troubles_of(writer: Deconfliction) -> list[str]:
+    """Return why requests that write would not be answered well at present."""
+    troubles = []
+    if not writer.is_running:
+        troubles.append("the ledger writer has stopped")
+    if writer.trouble is not None:
+        troubles.append(f"the last write failed: {writer.trouble}")
+    if writer.is_full:
+        troubles.append(f"the queue is full: {writer.waiting} requests are waiting")
+    if writer.waiting_s > _LONGEST_WAIT_S:
+        troubles.append(f"the first request in the queue has waited for {writer.waiting_s:.0f} s")
+    return troubles

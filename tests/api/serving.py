@@ -1,9 +1,10 @@
-"""A running application without sockets: its lifespan, and httpx in front of it."""
+"""A running application without sockets: its settings, its lifespan, and httpx in front of it."""
 
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -12,6 +13,15 @@ from fastapi import FastAPI
 from starlette.types import Receive, Scope, Send
 
 from app.service import Service
+from app.settings import Settings
+from tests.ledger.district import District
+
+
+def settings_for(district: District, ledger: str, folder: Path, **options: object) -> Settings:
+    """Return settings for a district, whose airspace file is written into a folder."""
+    airspace = folder / "airspace.json"
+    district.airspace.write(airspace)
+    return Settings.model_validate({"ledger": ledger, "airspace": airspace, **options})
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,10 @@ from app.routes.airspace import (
     StaticAnswer,
     StatusAnswer,
 )
-from app.settings import Settings
 from app.times import format_time, parse_time
 from planner.airmatrix import AirMatrix
 from tests.api.bodies import SUBMIT, intent, problem
-from tests.api.serving import Client, served
+from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, OLD_TOWN, START_MS, STREET
 from tests.ledger.process import FakeClock
 
@@ -32,11 +31,9 @@ ARRIVAL_MS = DEPARTURE_MS + 7 * LINK_MS
 
 
 @pytest.fixture
-def flown(tmp_path: Path, clock: FakeClock) -> Iterator[Client]:
+def flown(ledger: str, tmp_path: Path, clock: FakeClock) -> Iterator[Client]:
     """Return a client of a street that one flight uses from 08:01:00.000 to 08:01:11.676."""
-    STREET.airspace.write(tmp_path / "airspace.json")
-    settings = Settings(ledger=str(tmp_path / "ledger.sqlite"), airspace=tmp_path / "airspace.json")
-    with served(create_app(settings, clock)) as client:
+    with served(create_app(settings_for(STREET, ledger, tmp_path), clock)) as client:
         assert client.post(SUBMIT, json=intent("W", "E", district=STREET)).status_code == 201
         yield client
 
@@ -164,6 +161,7 @@ def test_status_names_the_blocks_in_use_and_by_whom(flown: Client) -> None:
     flight = the_flight(flown)
     assert answer == {
         "at": format_time(DEPARTURE_MS + LINK_MS + 1),
+        "removed_before": None,
         "counts": {"green": 2, "yellow": 0, "red": 0},
         "blocks": [{"block": [i, 0, 0], "status": "green", "reasons": [], "flight_intents": [flight]} for i in (1, 2)],
     }
@@ -187,6 +185,7 @@ def test_status_is_exact_to_the_millisecond(flown: Client, time_ms: int, columns
 def test_status_is_of_now_by_default(flown: Client, clock: FakeClock) -> None:
     assert flown.get(STATUS).json() == {
         "at": "2026-11-22T08:00:00.000Z",
+        "removed_before": None,
         "counts": {"green": 0, "yellow": 0, "red": 0},
         "blocks": [],
     }
@@ -295,7 +294,7 @@ def test_status_as_geojson_has_footprints_and_heights(client: Client) -> None:
     response = client.get(STATUS, **at(DEPARTURE_MS, f="geojson"))
     answer = response.json()
     assert response.headers["content-type"] == "application/geo+json"
-    assert set(answer) == {"type", "at", "features"}
+    assert set(answer) == {"type", "at", "removed_before", "features"}
     FeatureCollection.model_validate(answer)
     upper = answer["features"][1]
     assert set(upper) == {"type", "geometry", "properties"}
@@ -347,6 +346,7 @@ def test_a_block_says_where_it_is_and_who_uses_it_when(flown: Client) -> None:
         "statically_occupied": False,
         "status": "idle",
         "reasons": [],
+        "removed_before": None,
         "schedule": [
             {
                 "flight_intent_id": the_flight(flown),
@@ -427,6 +427,7 @@ def test_occupancy_is_the_seconds_of_use_of_each_block(flown: Client) -> None:
     assert answer == {
         "from": "2026-11-22T08:00:00.000Z",
         "to": "2026-11-22T09:00:00.000Z",
+        "removed_before": None,
         "blocks": [{"block": [i, 0, 0], "seconds": one if i in (0, 7) else both} for i in range(8)],
     }
     OccupancyAnswer.model_validate(answer)

@@ -5,7 +5,9 @@ from collections.abc import Callable, Iterator
 import httpx
 import pytest
 
+from app import problems
 from app.client import Client, ClientError, ProblemAnswer, ServiceUnreachable, grid_of
+from app.errors import NotReady
 from app.flight_intents import State
 from app.times import now_ms
 from planner.errors import Block
@@ -154,7 +156,7 @@ def test_the_journal_continues_after_a_revision(town: Client, later: int) -> Non
 
 def test_a_ready_service_says_so(town: Client) -> None:
     readiness = town.readiness()
-    assert (readiness.status, readiness.waiting, readiness.reason) == ("ready", 0, None)
+    assert (readiness.status, readiness.mode, readiness.waiting) == ("ready", "read-write", 0)
 
 
 def test_a_recorded_refusal_is_a_problem_with_its_members(town: Client, later: int) -> None:
@@ -249,8 +251,8 @@ def test_a_redirect_is_a_client_error() -> None:
 
 
 def test_a_service_that_is_not_ready_says_why() -> None:
-    unready = {"status": "not ready", "revision": None, "waiting": 3, "reason": "the ledger writer has stopped"}
+    unready = problems.response_to(NotReady("the ledger writer has stopped", waiting=3))
     with pytest.raises(ProblemAnswer) as problem:
-        answering(lambda _: httpx.Response(503, json=unready)).readiness()
+        answering(lambda _: httpx.Response(503, content=bytes(unready.body))).readiness()
     assert (problem.value.status, problem.value.reason) == (503, "the ledger writer has stopped")
     assert "the ledger writer has stopped" in str(problem.value)

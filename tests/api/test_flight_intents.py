@@ -8,29 +8,21 @@ import pytest
 from app.flight_intents import State
 from app.main import create_app
 from app.routes.flight_intents import FlightIntentAnswer, FlightIntentPage, PlannedFlightBody
-from app.settings import Settings
 from app.times import format_time, parse_time
 from planner.airspace import OccupancyRule
 from tests.api.bodies import FLIGHT_INTENT, PLANNED, PREVIEW, PREVIEWED, PROBLEM, SUBMIT, intent, problem
-from tests.api.serving import Client, served
-from tests.ledger.district import DEPARTURE_MS, OLD_TOWN, START_MS, STREET, District, district
+from tests.api.serving import Client, served, settings_for
+from tests.ledger.district import DEPARTURE_MS, OLD_TOWN, START_MS, STREET, district
 from tests.ledger.process import DAY_MS, FakeClock
 
 HORIZON_MS = 30 * DAY_MS
 REFUSAL = PROBLEM | {"reason", "flight_intent_id", "sequence", "conflicting_intents", "earliest_feasible_departure"}
 
 
-def settings_for(place: District, folder: Path, **options: object) -> Settings:
-    place.airspace.write(folder / "airspace.json")
-    return Settings.model_validate(
-        {"ledger": str(folder / "ledger.sqlite"), "airspace": folder / "airspace.json", **options}
-    )
-
-
 @pytest.fixture
-def street(tmp_path: Path, clock: FakeClock) -> Iterator[Client]:
+def street(ledger: str, tmp_path: Path, clock: FakeClock) -> Iterator[Client]:
     """Return a client of a service over one street."""
-    with served(create_app(settings_for(STREET, tmp_path), clock)) as client:
+    with served(create_app(settings_for(STREET, ledger, tmp_path), clock)) as client:
         yield client
 
 
@@ -136,7 +128,7 @@ def test_waypoints_are_block_centres_with_nine_decimals(client: Client) -> None:
 
 def test_the_terminal_dwell_is_flight_time_but_no_hover(tmp_path: Path, clock: FakeClock) -> None:
     slow = district("W......E", terminal_dwell_ms=30_000)
-    with served(create_app(settings_for(slow, tmp_path), clock)) as client:
+    with served(create_app(settings_for(slow, str(tmp_path / "ledger.sqlite"), tmp_path), clock)) as client:
         answer = client.post(SUBMIT, json=along()).json()
     assert (answer["flight_time_s"], answer["hover_s"], answer["delay_s"]) == (71.676, 0.0, 0.0)
     first, last = answer["trajectory"][0], answer["trajectory"][-1]
@@ -153,7 +145,8 @@ def test_positions_anywhere_in_a_block_are_kept_as_given(client: Client) -> None
 
 
 def test_the_midpoint_rule_holds_less(tmp_path: Path, clock: FakeClock) -> None:
-    with served(create_app(settings_for(district("W.E", rule=OccupancyRule.MIDPOINT), tmp_path), clock)) as client:
+    midpoint = district("W.E", rule=OccupancyRule.MIDPOINT)
+    with served(create_app(settings_for(midpoint, str(tmp_path / "ledger.sqlite"), tmp_path), clock)) as client:
         held = client.post(SUBMIT, json=intent("W", "E", district=district("W.E"))).json()["reservations"]
     assert [(parse_time(hold["enter"]), parse_time(hold["exit"])) for hold in held] == [
         (DEPARTURE_MS, DEPARTURE_MS + 835),
@@ -199,8 +192,9 @@ endurance_s = {seconds}
 def test_an_aircraft_without_the_endurance_is_refused(
     endurance_s: float, status: int, tmp_path: Path, clock: FakeClock
 ) -> None:
-    (tmp_path / "aircraft.toml").write_text(ENDURANCE.format(seconds=endurance_s))
-    settings = settings_for(STREET, tmp_path, aircraft_types=tmp_path / "aircraft.toml")
+    ledger, aircraft_types = str(tmp_path / "ledger.sqlite"), tmp_path / "aircraft.toml"
+    aircraft_types.write_text(ENDURANCE.format(seconds=endurance_s))
+    settings = settings_for(STREET, ledger, tmp_path, aircraft_types=aircraft_types)
     with served(create_app(settings, clock)) as client:
         response = client.post(SUBMIT, json=along(aircraft_type="mayfly"))
         assert response.status_code == status

@@ -1,7 +1,6 @@
 """Idempotency-Key: the same request again brings the first answer again, byte for byte."""
 
 import asyncio
-from pathlib import Path
 
 import httpx
 import pytest
@@ -11,7 +10,8 @@ from app.settings import Settings
 from tests.api.bodies import SUBMIT, intent, problem
 from tests.api.serving import Client, serving
 from tests.ledger.district import DEPARTURE_MS, START_MS
-from tests.ledger.process import DAY_MS, FakeClock, until, write_lock
+from tests.ledger.locations import write_lock
+from tests.ledger.process import DAY_MS, FakeClock, until
 
 KEY = {"Idempotency-Key": "7c1b"}
 
@@ -111,12 +111,12 @@ def test_a_key_without_or_with_too_many_signs_is_refused(client: Client, key: st
     assert [error["loc"] for error in answer["errors"]] == [["header", "idempotency-key"]]
 
 
-def test_duplicates_in_flight_make_one_intent(settings: Settings, clock: FakeClock, ledger_path: Path) -> None:
+def test_duplicates_in_flight_make_one_intent(settings: Settings, clock: FakeClock) -> None:
     async def race() -> list[httpx.Response]:
         async with serving(create_app(settings, clock)) as (http, service):
-            with write_lock(ledger_path):
+            with write_lock(settings.ledger):
                 tasks = [asyncio.create_task(http.post(SUBMIT, json=intent(), headers=KEY)) for _ in range(6)]
-                await until(lambda: service.deconfliction.waiting == 5)
+                await until(lambda: service.writer.waiting == 5)
             answers = await asyncio.gather(*tasks)
             listed = await http.get(SUBMIT)
             assert len(listed.json()["items"]) == 1

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from app.main import create_app
-from app.settings import Settings
 from tests.api.bodies import PREVIEW, PROBLEM, SUBMIT, intent, problem
-from tests.api.serving import Client, served
+from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import OLD_TOWN, START_MS
 from tests.ledger.process import FakeClock
 
@@ -22,8 +21,7 @@ JSON = {"Content-Type": "application/json"}
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     """Return a client of a service that nothing is ever recorded in."""
     folder: Path = tmp_path_factory.mktemp("validation")
-    OLD_TOWN.airspace.write(folder / "airspace.json")
-    settings = Settings(ledger=str(folder / "ledger.sqlite"), airspace=folder / "airspace.json")
+    settings = settings_for(OLD_TOWN, str(folder / "ledger.sqlite"), folder)
     with served(create_app(settings, FakeClock())) as client:
         yield client
 

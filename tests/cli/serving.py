@@ -1,15 +1,17 @@
 """`airmatrix serve` as a process of its own, on loopback and a port that the system chooses."""
 
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import httpx
 
@@ -35,6 +37,16 @@ class Server:
         """The ledger that `serve` makes where none is named."""
         return self.folder / "airmatrix.sqlite"
 
+    def entries(self, *events: str) -> list[dict[str, Any]]:
+        """Return what was logged, all or these events, by a server that logs in JSON."""
+        lines = [json.loads(line) for line in self.log.read_text().splitlines() if line.startswith("{")]
+        return [line for line in lines if not events or line["event"] in events]
+
+    def workers(self) -> set[int]:
+        """Return the process ids of the workers that are ready and have not died."""
+        dead = {line["worker"] for line in self.entries("worker died, another one is started")}
+        return {line["worker"] for line in self.entries("worker is ready")} - dead
+
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal, wait for the end, and return the exit status."""
         self.process.send_signal(number)
@@ -49,13 +61,18 @@ def environment(**variables: str) -> dict[str, str]:
 
 @contextmanager
 def started(
-    folder: Path, *options: str, log: str = "serve.log", **variables: str
+    folder: Path,
+    *options: str,
+    log: str = "serve.log",
+    program: Sequence[str | Path] = (AIRMATRIX,),
+    **variables: str,
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """Start `airmatrix serve` in a folder; it is ended afterwards if it still runs."""
+    """Start `airmatrix serve` in a folder and a process group; it is ended afterwards if it still runs."""
     with (folder / log).open("wb") as stderr:
         process = subprocess.Popen(
-            [AIRMATRIX, "serve", *options], cwd=folder, env=environment(**variables), stderr=stderr
-        )
+            [*program, "serve", *options],
+            cwd=folder, env=environment(**variables), stderr=stderr, start_new_session=True,
+        )  # fmt: skip
     try:
         yield process
     finally:
@@ -69,16 +86,21 @@ def started(
 
 
 @contextmanager
-def serving(folder: Path, *options: str, **variables: str) -> Iterator[Server]:
+def serving(
+    folder: Path,
+    *options: str,
+    log: str = "serve.log",
+    program: Sequence[str | Path] = (AIRMATRIX,),
+    **variables: str,
+) -> Iterator[Server]:
     """Serve on any free port, and wait until the service is ready."""
-    log = folder / "serve.log"
-    with started(folder, "--port", "0", *options, **variables) as process:
+    with started(folder, "--port", "0", *options, log=log, program=program, **variables) as process:
         until = time.monotonic() + _READY_WITHIN_S
-        while not (url := ready_url(log)):
+        while not (url := ready_url(folder / log)):
             if process.poll() is not None or time.monotonic() > until:
-                raise AssertionError(f"the service did not become ready:\n{log.read_text()}")
+                raise AssertionError(f"the service did not become ready:\n{(folder / log).read_text()}")
             time.sleep(0.02)
-        yield Server(url, folder, log, process)
+        yield Server(url, folder, folder / log, process)
 
 
 def ready_url(log: Path) -> str | None:

@@ -1,26 +1,23 @@
 """One process's worth of the service without HTTP, so that tests can run several on one ledger."""
 
 import asyncio
-import sqlite3
 import time
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
 from app.deconfliction import Deconfliction, IdempotencyKey, Outcome, Policy
 from app.flight_intents import FlightIntent, Submission
-from app.ledger import create_or_upgrade, open_ledger
+from app.ledger import open_ledger
 from planner.aircraft import shipped_aircraft_types
 from planner.airspace import Airspace
 from planner.cfa_star import Performance, Planner, Search
 from planner.kernels import intervals
 from tests.ledger.district import START_MS
+from tests.ledger.locations import Stranger, database, write_lock
 
 Hold = tuple[int, int, int]  # block, enter, exit
 
@@ -43,31 +40,20 @@ class FakeClock:
         self.now_ms += round(seconds * 1000) + ms
 
 
-@cache
-def migrated_ledger() -> bytes:
-    """Return the bytes of a new ledger at the newest schema, so that tests need not migrate one each."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "ledger.sqlite"
-        create_or_upgrade(str(path))
-        return path.read_bytes()
-
-
 class Process:
-    """Ledger connections, planner, index and writer on one ledger file, which is created if absent."""
+    """Ledger connections, planner, index and writer on one migrated ledger."""
 
     def __init__(
         self,
-        path: Path,
+        location: str,
         airspace: Airspace,
         clock: Callable[[], int],
         *,
         policy: Policy = POLICY,
         search: Search = Search.SAFE_INTERVAL,
     ) -> None:
-        if not path.exists():
-            path.write_bytes(migrated_ledger())
-        self.path = path
-        self.ledger = open_ledger(str(path), airspace, claim=True)
+        self.location = location
+        self.ledger = open_ledger(location, airspace, claim=True)
         self.planner = Planner(airspace, search)
         performances = {type_.id: Performance.of(type_, airspace.grid) for type_ in shipped_aircraft_types()}
         self.deconfliction = Deconfliction(self.ledger, self.planner, performances, clock, policy)
@@ -95,7 +81,7 @@ class Process:
         return asyncio.run(self._together(requests))
 
     async def _together(self, requests: tuple[Coroutine[Any, Any, Any], ...]) -> list[Any]:
-        with write_lock(self.path):
+        with write_lock(self.location):
             tasks = [asyncio.create_task(request) for request in requests]
             await until(lambda: self.deconfliction.waiting == len(requests) - 1)
         return await asyncio.gather(*tasks, return_exceptions=True)
@@ -124,54 +110,35 @@ async def until(reached: Callable[[], bool]) -> None:
         await asyncio.sleep(0.001)
 
 
-@contextmanager
-def database(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a ledger as a stranger would; foreign keys are not enforced."""
-    connection = sqlite3.connect(path, isolation_level=None, timeout=10)
-    try:
-        yield connection
-    finally:
-        connection.close()
-
-
-@contextmanager
-def write_lock(path: Path) -> Iterator[None]:
-    """Hold the write lock of a ledger."""
-    with database(path) as connection:
-        connection.execute("BEGIN IMMEDIATE")
-        yield
-        connection.execute("COMMIT")
-
-
-def reserved(path: Path, after_ms: int = 0) -> dict[Hold, int]:
+def reserved(ledger: str | Path | Stranger, after_ms: int = 0) -> dict[Hold, int]:
     """Return the ledger's reservations that end after a time, with the sequence numbers of their intents."""
-    with database(path) as connection:
-        rows = connection.execute('SELECT block, enter, "exit", intent FROM reservations WHERE "exit" > ?', [after_ms])
-        return {(block, enter, leave): intent for block, enter, leave, intent in rows}
+    with database(ledger) as connection:
+        rows = connection.rows('SELECT block, enter, "exit", intent FROM reservations WHERE "exit" > ?', [after_ms])
+    return {(block, enter, leave): intent for block, enter, leave, intent in rows}
 
 
-def assert_no_overlaps(path: Path) -> None:
+def assert_no_overlaps(ledger: str | Path | Stranger) -> None:
     """Fail if two reservations of a block overlap, or one is empty."""
-    holds = sorted(reserved(path))
+    holds = sorted(reserved(ledger))
     for (block, _, leave), (other_block, enter, _) in pairwise(holds):
         assert block != other_block or leave <= enter
     assert all(enter < leave for _, enter, leave in holds)
 
 
-def assert_gapless(path: Path) -> None:
+def assert_gapless(ledger: str | Path | Stranger) -> None:
     """Fail if a sequence number or revision is missing, or the counters lag behind."""
-    with database(path) as connection:
-        sequences = [row[0] for row in connection.execute("SELECT sequence FROM flight_intents ORDER BY sequence")]
-        revisions = [row[0] for row in connection.execute("SELECT revision FROM journal ORDER BY revision")]
-        counters = connection.execute("SELECT sequence, revision FROM counters").fetchone()
+    with database(ledger) as connection:
+        sequences = [row[0] for row in connection.rows("SELECT sequence FROM flight_intents ORDER BY sequence")]
+        revisions = [row[0] for row in connection.rows("SELECT revision FROM journal ORDER BY revision")]
+        counters = connection.rows("SELECT sequence, revision FROM counters")
     assert sequences == list(range(1, len(sequences) + 1))
     assert revisions == list(range(1, len(revisions) + 1))
-    assert counters == (len(sequences), len(revisions))
+    assert counters == [(len(sequences), len(revisions))]
 
 
-def assert_journal_tells_states(path: Path) -> None:
+def assert_journal_tells_states(ledger: str | Path | Stranger) -> None:
     """Fail unless every intent's state and version are those of its newest journal entry."""
-    with database(path) as connection:
-        states = dict(connection.execute("SELECT sequence, state || version FROM flight_intents").fetchall())
-        newest = dict(connection.execute("SELECT intent, kind || revision FROM journal ORDER BY revision").fetchall())
+    with database(ledger) as connection:
+        states = dict(connection.rows("SELECT sequence, state || version FROM flight_intents"))
+        newest = dict(connection.rows("SELECT intent, kind || revision FROM journal ORDER BY revision"))
     assert states == newest

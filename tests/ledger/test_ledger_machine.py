@@ -1,17 +1,27 @@
 """Any sequence of submissions, cancellations, restarts and passing time keeps ledger, index and journal in step."""
 
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from contextlib import ExitStack
+from typing import ClassVar
 
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, MultipleResults, RuleBasedStateMachine, initialize, invariant, multiple, rule
+from hypothesis.stateful import (
+    Bundle,
+    MultipleResults,
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    multiple,
+    rule,
+    run_state_machine_as_test,
+)
 
 from app.errors import DepartureInThePast, IllegalTransition
 from app.flight_intents import FlightIntent, State
 from planner.errors import Block
 from tests.ledger.district import district
+from tests.ledger.locations import Ledgers, database
 from tests.ledger.process import (
     FakeClock,
     Process,
@@ -28,23 +38,29 @@ BLOCKS: list[Block] = [YARD.airspace.grid.block(block) for block in range(24) if
 class LedgerMachine(RuleBasedStateMachine):
     """The model is small: what each intent held when it was accepted, and when it was cancelled."""
 
+    ledgers: ClassVar[Ledgers]
     intents: Bundle[FlightIntent] = Bundle("intents")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open_until_the_end = ExitStack()
 
     @initialize()
     def start(self) -> None:
-        self.folder = TemporaryDirectory()
+        self.location = self.ledgers.migrated()
+        self.stranger = self.open_until_the_end.enter_context(database(self.location))
         self.clock = FakeClock()
         self.states: dict[int, State] = {}
         self.kept: set[tuple[int, int, int, int]] = set()
         self.open()
 
     def open(self) -> None:
-        self.process = Process(Path(self.folder.name) / "ledger.sqlite", YARD.airspace, self.clock)
+        self.process = Process(self.location, YARD.airspace, self.clock)
 
     def teardown(self) -> None:
         if hasattr(self, "process"):
             self.process.__exit__(None, None, None)
-            self.folder.cleanup()
+        self.open_until_the_end.close()
 
     @rule(
         target=intents,
@@ -90,20 +106,20 @@ class LedgerMachine(RuleBasedStateMachine):
 
     @invariant()
     def the_ledger_holds_what_was_answered(self) -> None:
-        table = reserved(self.process.path)
+        table = reserved(self.stranger)
         assert {(*hold, intent) for hold, intent in table.items()} == self.kept
         assert {intent.sequence: intent.state for intent in self.process.ledger.everything()[0]} == self.states
 
     @invariant()
     def nothing_overlaps_and_nothing_is_missing(self) -> None:
-        assert_no_overlaps(self.process.path)
-        assert_gapless(self.process.path)
-        assert_journal_tells_states(self.process.path)
+        assert_no_overlaps(self.stranger)
+        assert_gapless(self.stranger)
+        assert_journal_tells_states(self.stranger)
 
     @invariant()
     def the_index_is_the_table_but_for_the_past(self) -> None:
         now_ms = self.clock.now_ms
-        assert self.process.indexed(now_ms) == reserved(self.process.path, now_ms)
+        assert self.process.indexed(now_ms) == reserved(self.stranger, now_ms)
 
 
 def holds(intent: FlightIntent) -> set[tuple[int, int, int, int]]:
@@ -113,5 +129,7 @@ def holds(intent: FlightIntent) -> set[tuple[int, int, int, int]]:
     return {(block, enter, leave, intent.sequence) for block, enter, leave in columns}
 
 
-LedgerMachine.TestCase.settings = settings(deadline=None, max_examples=12, stateful_step_count=20)
-TestLedgerMachine = pytest.mark.compiled(LedgerMachine.TestCase)
+@pytest.mark.compiled
+def test_ledger_index_and_journal_stay_in_step(ledgers: Ledgers) -> None:
+    machine = type("Machine", (LedgerMachine,), {"ledgers": ledgers})
+    run_state_machine_as_test(machine, settings=settings(deadline=None, max_examples=12, stateful_step_count=20))

@@ -5,9 +5,9 @@ import random
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
+from sqlalchemy import Engine, event
 
 from app.errors import IllegalTransition
 from app.flight_intents import FlightIntent, State
@@ -24,10 +24,10 @@ from tests.ledger.test_restart import described, random_submission
 
 
 @pytest.fixture
-def pair(ledger_path: Path, clock: FakeClock) -> Iterator[tuple[Process, Process]]:
+def pair(ledger: str, clock: FakeClock) -> Iterator[tuple[Process, Process]]:
     with (
-        Process(ledger_path, STREET.airspace, clock) as one,
-        Process(ledger_path, STREET.airspace, clock) as other,
+        Process(ledger, STREET.airspace, clock) as one,
+        Process(ledger, STREET.airspace, clock) as other,
     ):
         yield one, other
 
@@ -77,7 +77,7 @@ def test_a_process_sees_space_that_another_freed_and_gave_away_again(pair: tuple
     assert third.trajectory is not None
     assert second.trajectory is not None
     assert third.trajectory.departure_ms > second.trajectory.departure_ms
-    assert_no_overlaps(one.path)
+    assert_no_overlaps(one.location)
 
 
 def test_a_process_keeps_what_a_flight_holds_that_another_cancelled_in_the_air(
@@ -89,14 +89,35 @@ def test_a_process_keeps_what_a_flight_holds_that_another_cancelled_in_the_air(
     other.cancel(first)
     other.submit(STREET.submission("E", "W"))
     one.submit(STREET.submission("E", "W"))
-    assert one.indexed(clock.now_ms) == reserved(one.path, clock.now_ms)
+    assert one.indexed(clock.now_ms) == reserved(one.location, clock.now_ms)
+
+
+def test_what_is_read_in_several_steps_is_of_one_moment(pair: tuple[Process, Process]) -> None:
+    one, other = pair
+    intent = one.submit(STREET.submission("W", "E"))
+
+    cancelled: list[FlightIntent] = []
+
+    def cancel_meanwhile(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        if statement.startswith("SELECT flight_intents") and not cancelled:
+            cancelled.append(intent)
+            other.cancel(intent)
+
+    event.listen(Engine, "after_cursor_execute", cancel_meanwhile)
+    try:
+        (listed,) = one.ledger.page(after_sequence=0, limit=10)
+    finally:
+        event.remove(Engine, "after_cursor_execute", cancel_meanwhile)
+    assert described(listed) == described(intent)
+    (listed,) = one.ledger.page(after_sequence=0, limit=10)
+    assert (listed.state, len(listed.reservations)) == (State.CANCELLED, 0)
 
 
 @pytest.mark.compiled
-def test_a_process_that_lags_far_behind_catches_up(ledger_path: Path, clock: FakeClock) -> None:
+def test_a_process_that_lags_far_behind_catches_up(ledger: str, clock: FakeClock) -> None:
     with (
-        Process(ledger_path, SQUARE.airspace, clock) as one,
-        Process(ledger_path, SQUARE.airspace, clock) as other,
+        Process(ledger, SQUARE.airspace, clock) as one,
+        Process(ledger, SQUARE.airspace, clock) as other,
     ):
 
         async def submit_many() -> None:
@@ -105,16 +126,16 @@ def test_a_process_that_lags_far_behind_catches_up(ledger_path: Path, clock: Fak
 
         asyncio.run(submit_many())
         assert other.submit(SQUARE.submission("N", "S")).version == 1002
-        assert other.indexed(clock.now_ms) == reserved(ledger_path)
-    assert_no_overlaps(ledger_path)
+        assert other.indexed(clock.now_ms) == reserved(ledger)
+    assert_no_overlaps(ledger)
 
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("seed", range(3))
-def test_racing_processes_never_overlap_and_leave_no_gaps(seed: int, ledger_path: Path, clock: FakeClock) -> None:
+def test_racing_processes_never_overlap_and_leave_no_gaps(seed: int, ledger: str, clock: FakeClock) -> None:
     with (
-        Process(ledger_path, SQUARE.airspace, clock) as one,
-        Process(ledger_path, SQUARE.airspace, clock) as other,
+        Process(ledger, SQUARE.airspace, clock) as one,
+        Process(ledger, SQUARE.airspace, clock) as other,
     ):
 
         def operator(process: Process, number: int) -> Callable[[], None]:
@@ -132,25 +153,25 @@ def test_racing_processes_never_overlap_and_leave_no_gaps(seed: int, ledger_path
         at_once(*(operator(process, number) for number, process in enumerate((one, other, one, other))))
         assert len(one.ledger.everything()[0]) == 100
         assert {intent.state for intent in one.ledger.everything()[0]} >= {State.ACCEPTED, State.CANCELLED}
-        assert_no_overlaps(ledger_path)
-        assert_gapless(ledger_path)
-        assert_journal_tells_states(ledger_path)
+        assert_no_overlaps(ledger)
+        assert_gapless(ledger)
+        assert_journal_tells_states(ledger)
         for process in (one, other):
             process.submit(SQUARE.submission("N", "S", earliest_ms=START_MS + 86_400_000))
         one.submit(SQUARE.submission("N", "S", earliest_ms=START_MS + 86_400_000))
-        assert one.indexed(0) == reserved(ledger_path)
+        assert one.indexed(0) == reserved(ledger)
 
 
-def test_processes_with_different_clocks_never_overlap(ledger_path: Path) -> None:
+def test_processes_with_different_clocks_never_overlap(ledger: str) -> None:
     early, late = FakeClock(), FakeClock(START_MS + 120_000)
     with (
-        Process(ledger_path, STREET.airspace, early) as one,
-        Process(ledger_path, STREET.airspace, late) as other,
+        Process(ledger, STREET.airspace, early) as one,
+        Process(ledger, STREET.airspace, late) as other,
     ):
         for n in range(12):
             process = (one, other)[n % 2]
             process.submit(STREET.submission("WE"[n % 2], "EW"[n % 2], window_ms=900_000))
             early.advance(seconds=11)
             late.advance(seconds=11)
-    assert_no_overlaps(ledger_path)
-    assert_gapless(ledger_path)
+    assert_no_overlaps(ledger)
+    assert_gapless(ledger)

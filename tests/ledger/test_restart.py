@@ -1,9 +1,6 @@
 """Restarting changes nothing: a new process on the same ledger plans exactly what the old one would have planned."""
 
 import random
-import sqlite3
-from contextlib import closing
-from pathlib import Path
 
 import pytest
 
@@ -11,6 +8,7 @@ from app.flight_intents import FlightIntent, State, Submission
 from planner.cfa_star import Search
 from planner.errors import Block
 from tests.ledger.district import OLD_TOWN, SQUARE, START_MS, District
+from tests.ledger.locations import Ledgers
 from tests.ledger.process import FakeClock, Process, assert_gapless, assert_no_overlaps, reserved
 
 
@@ -46,14 +44,6 @@ def busy(process: Process, district: District, clock: FakeClock, chance: random.
         clock.advance(ms=chance.choice([0, 0, 1, 500, 15_000]))
 
 
-def copy_of(ledger: Path, target: Path) -> Path:
-    """Copy a ledger in use."""
-    with closing(sqlite3.connect(ledger)) as source, closing(sqlite3.connect(target)) as copy:
-        source.backup(copy)
-        copy.execute("PRAGMA journal_mode = WAL")
-    return target
-
-
 def described(intent: FlightIntent) -> object:
     """Return all of an intent but its random id."""
     trajectory, refusal, held = intent.trajectory, intent.refusal, intent.reservations
@@ -72,51 +62,53 @@ def described(intent: FlightIntent) -> object:
 @pytest.mark.parametrize("search", Search)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_restarted_process_plans_what_one_that_kept_running_plans(
-    seed: int, search: Search, tmp_path: Path, clock: FakeClock
+    seed: int, search: Search, ledgers: Ledgers, clock: FakeClock
 ) -> None:
     chance = random.Random(seed)
     district = chance.choice([OLD_TOWN, SQUARE])
-    with Process(tmp_path / "old.sqlite", district.airspace, clock, search=search) as old:
+    with Process(ledgers.migrated(), district.airspace, clock, search=search) as old:
         busy(old, district, clock, chance, steps=60)
-        copy = copy_of(old.path, tmp_path / "new.sqlite")
+        # PostgreSQL copies only what nobody is connected to; the old process connects again by itself.
+        old.ledger.close()
+        copy = ledgers.copy(old.location)
         with Process(copy, district.airspace, clock, search=search) as new:
-            assert new.indexed(clock.now_ms) == old.indexed(clock.now_ms) == reserved(old.path, clock.now_ms)
+            assert new.indexed(clock.now_ms) == old.indexed(clock.now_ms) == reserved(old.location, clock.now_ms)
             for _ in range(30):
                 request = random_submission(district, chance, clock.now_ms)
                 assert described(new.submit(request)) == described(old.submit(request))
                 clock.advance(ms=chance.choice([0, 1, 15_000]))
-        assert_no_overlaps(old.path)
-        assert_gapless(old.path)
+        assert_no_overlaps(old.location)
+        assert_gapless(old.location)
 
 
-def test_a_restarted_process_keeps_to_what_was_reserved_before(ledger_path: Path, clock: FakeClock) -> None:
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+def test_a_restarted_process_keeps_to_what_was_reserved_before(ledger: str, clock: FakeClock) -> None:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         first = process.submit(SQUARE.submission("N", "S"))
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
-        assert process.indexed(0) == dict.fromkeys(reserved(ledger_path), first.sequence)
+    with Process(ledger, SQUARE.airspace, clock) as process:
+        assert process.indexed(0) == dict.fromkeys(reserved(ledger), first.sequence)
         second = process.submit(SQUARE.submission("N", "S"))
     assert (first.sequence, second.sequence) == (1, 2)
-    assert_no_overlaps(ledger_path)
+    assert_no_overlaps(ledger)
 
 
-def test_a_restarted_process_loads_nothing_that_has_passed(ledger_path: Path, clock: FakeClock) -> None:
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+def test_a_restarted_process_loads_nothing_that_has_passed(ledger: str, clock: FakeClock) -> None:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         process.submit(SQUARE.submission("N", "S"))
     clock.advance(seconds=3600)
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         assert process.indexed(0) == {}
 
 
-def test_a_process_that_keeps_running_forgets_what_has_passed(ledger_path: Path, clock: FakeClock) -> None:
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+def test_a_process_that_keeps_running_forgets_what_has_passed(ledger: str, clock: FakeClock) -> None:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         process.submit(SQUARE.submission("N", "S"))
         clock.advance(seconds=3600)
         later = process.submit(SQUARE.submission("N", "S", earliest_ms=START_MS + 7_200_000))
         assert set(process.indexed(0).values()) == {later.sequence}
 
 
-def test_the_ledger_keeps_what_the_index_forgets(ledger_path: Path, clock: FakeClock) -> None:
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+def test_the_ledger_keeps_what_the_index_forgets(ledger: str, clock: FakeClock) -> None:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         first = process.submit(SQUARE.submission("N", "S"))
         clock.advance(seconds=3600)
         process.submit(SQUARE.submission("N", "S", earliest_ms=START_MS + 7_200_000))

@@ -2,12 +2,11 @@
 
 import asyncio
 import contextlib
-import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Never
+from urllib.parse import urlsplit
 
 import pytest
 import structlog
@@ -26,6 +25,7 @@ from app.errors import (
 )
 from app.flight_intents import FlightIntent, Reservations, State
 from tests.ledger.district import DEPARTURE_MS, SQUARE, START_MS, STREET
+from tests.ledger.locations import database, on_postgresql, on_sqlite, write_lock
 from tests.ledger.process import (
     DAY_MS,
     POLICY,
@@ -35,23 +35,21 @@ from tests.ledger.process import (
     assert_gapless,
     assert_journal_tells_states,
     assert_no_overlaps,
-    database,
     outcomes,
     reserved,
     until,
-    write_lock,
 )
 
 
 @pytest.fixture
-def street(ledger_path: Path, clock: FakeClock) -> Iterator[Process]:
-    with Process(ledger_path, STREET.airspace, clock) as process:
+def street(ledger: str, clock: FakeClock) -> Iterator[Process]:
+    with Process(ledger, STREET.airspace, clock) as process:
         yield process
 
 
 @pytest.fixture
-def square(ledger_path: Path, clock: FakeClock) -> Iterator[Process]:
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+def square(ledger: str, clock: FakeClock) -> Iterator[Process]:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         yield process
 
 
@@ -87,10 +85,10 @@ def submit(process: Process, digest: str = "one body", name: str = "key", **requ
 
 def assert_sound(process: Process, now_ms: int = 0) -> None:
     """Fail unless table, index, counters and journal agree and nothing overlaps."""
-    assert_no_overlaps(process.path)
-    assert_gapless(process.path)
-    assert_journal_tells_states(process.path)
-    assert process.indexed(now_ms) == reserved(process.path, now_ms)
+    assert_no_overlaps(process.location)
+    assert_gapless(process.location)
+    assert_journal_tells_states(process.location)
+    assert process.indexed(now_ms) == reserved(process.location, now_ms)
 
 
 # Order and numbers
@@ -159,24 +157,39 @@ def test_requests_that_wait_together_are_committed_once(street: Process) -> None
     assert len(commits) == 1
 
 
-def test_everything_in_a_batch_has_one_now(ledger_path: Path) -> None:
+def test_everything_in_a_batch_has_one_now(ledger: str) -> None:
     ticking = FakeClock()
 
     def clock() -> int:
         ticking.advance(ms=7)
         return ticking.now_ms
 
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         answers = outcomes(process, *[SQUARE.submission("N", "S") for _ in range(3)])
     assert len({answer.intent.received_ms for answer in answers if isinstance(answer, Outcome)}) == 1
 
 
-def test_nothing_is_planned_before_a_moment_that_has_been_now(square: Process, clock: FakeClock) -> None:
+def test_a_clock_that_is_corrected_a_little_does_not_bring_back_moments_that_have_been(
+    square: Process, clock: FakeClock
+) -> None:
     clock.advance(seconds=100)
     square.submit(SQUARE.submission("N", "S"))
-    clock.advance(seconds=-50)
+    clock.advance(seconds=-10)
     intent = square.submit(SQUARE.submission("S", "N"))
     assert departure(intent) >= START_MS + 100_000
+
+
+def test_after_a_clock_was_wrong_by_a_day_the_service_goes_on_at_the_right_time(
+    street: Process, clock: FakeClock
+) -> None:
+    before = street.submit(STREET.submission("W", "E"))
+    clock.advance(seconds=86_400)
+    with pytest.raises(DepartureInThePast):
+        street.submit(STREET.submission("W", "E"))
+    clock.advance(seconds=-86_400)
+    intent = street.submit(STREET.submission("W", "E"))
+    assert departure(intent) > departure(before)
+    assert_sound(street)
 
 
 # Previews
@@ -203,41 +216,39 @@ def test_a_preview_leaves_ledger_and_index_as_they_were(street: Process) -> None
 # Neighbours in a batch
 
 
-def reserve_secretly(path: Path, holds: set[Hold], sequence: int) -> None:
-    """Insert reservations as somebody would who knows nothing of the journal."""
-    with database(path) as connection:
-        connection.executemany("INSERT INTO reservations VALUES (?, ?, ?, ?)", [(*hold, sequence) for hold in holds])
+def reserve_secretly(location: str, hold: Hold, sequence: int) -> None:
+    """Insert a reservation as somebody would who knows nothing of the journal."""
+    with database(location) as connection:
+        connection.execute("INSERT INTO reservations VALUES (?, ?, ?, ?)", (*hold, sequence))
 
 
 def test_a_request_that_the_database_refuses_harms_no_neighbour_in_its_batch(square: Process) -> None:
-    # Somebody has reserved the corner S without telling: N -> S fails, the flights beside it do not.
-    first = square.submit(SQUARE.submission("N", (1, 2, 0)))
-    reserve_secretly(square.path, {(SQUARE.block("S"), START_MS, START_MS + 3_600_000)}, first.sequence)
-    before, refused, after = outcomes(
+    with database(square.location) as connection:
+        connection.execute("CREATE UNIQUE INDEX one_flight_each ON flight_intents (operator)")
+    answers = outcomes(
         square,
-        SQUARE.submission((0, 0, 0), (1, 0, 0)),
-        SQUARE.submission("N", "S"),
-        SQUARE.submission((1, 0, 0), (0, 0, 0)),
+        SQUARE.submission("N", "S", operator="a"),
+        SQUARE.submission("N", "S", operator="a"),
+        SQUARE.submission("S", "N", operator="b"),
     )
+    before, refused, after = answers
     assert isinstance(before, Outcome)
     assert isinstance(after, Outcome)
-    assert [before.intent.sequence, after.intent.sequence] == [2, 3]
+    assert [before.intent.sequence, after.intent.sequence] == [1, 2]
     assert isinstance(refused, LedgerUnavailable)
-    assert len(square.ledger.everything()[0]) == 3
     assert_sound(square)
 
 
-def test_after_a_refusal_by_the_database_the_next_plan_avoids_what_the_index_had_missed(square: Process) -> None:
+def test_reservations_that_the_index_had_missed_are_planned_around_as_soon_as_the_database_shows_them(
+    square: Process,
+) -> None:
     first = square.submit(SQUARE.submission("N", (1, 2, 0)))
     secret = (SQUARE.block((1, 1, 0)), START_MS + 600_000, START_MS + 700_000)
-    reserve_secretly(square.path, {secret}, first.sequence)
-    there = SQUARE.submission((1, 0, 0), (1, 1, 0), earliest_ms=START_MS + 600_000, window_ms=600_000)
-    with pytest.raises(LedgerUnavailable):
-        square.submit(there)
-    again = square.submit(there)
+    reserve_secretly(square.location, secret, first.sequence)
+    intent = square.submit(SQUARE.submission((1, 0, 0), (1, 1, 0), earliest_ms=START_MS + 600_000, window_ms=600_000))
     # It arrives, and then stays no longer; its first moment there is the first free one.
-    (entered,) = [enter for block, enter, _ in held(again) if block == secret[0]]
-    assert entered == secret[2]
+    (entered,) = [enter for block, enter, _ in held(intent) if block == secret[0]]
+    assert (intent.sequence, entered) == (2, secret[2])
     assert_sound(square)
 
 
@@ -249,7 +260,9 @@ def on_commit(handler: Callable[[Connection], object]) -> Iterator[None]:
     """Call a handler with each writing connection that is about to commit."""
 
     def listener(connection: Connection) -> None:
-        if connection.exec_driver_sql("PRAGMA query_only").scalar() == 0:
+        is_sqlite = connection.dialect.name == "sqlite"
+        query = "PRAGMA query_only" if is_sqlite else "SELECT current_setting('transaction_read_only')::bool::int"
+        if connection.exec_driver_sql(query).scalar() == 0:
             handler(connection)
 
     event.listen(Engine, "commit", listener)
@@ -262,7 +275,7 @@ def on_commit(handler: Callable[[Connection], object]) -> Iterator[None]:
 def fail(connection: Connection) -> None:
     """Fail instead of committing."""
     del connection
-    raise OperationalError("COMMIT", {}, sqlite3.OperationalError("disk I/O error"))
+    raise OperationalError("COMMIT", {}, Exception("the connection was lost"))
 
 
 def commit_and_fail(connection: Connection) -> None:
@@ -327,7 +340,7 @@ def test_requests_whose_commit_was_lost_after_it_happened_are_answered_from_the_
     with on_commit(commit_and_fail):
         answers = outcomes(street, STREET.submission("W", "E", window_ms=0), STREET.submission("W", "E", window_ms=0))
     accepted, refused = (answer.intent for answer in answers if isinstance(answer, Outcome))
-    assert (accepted.sequence, accepted.state, held(accepted)) == (1, State.ACCEPTED, set(reserved(street.path)))
+    assert (accepted.sequence, accepted.state, held(accepted)) == (1, State.ACCEPTED, set(reserved(street.location)))
     assert refused.refusal is not None
     assert (refused.sequence, refused.refusal.reason) == (2, "no_departure_slot")
     assert refused.refusal.conflicting_intents == (accepted.id,)
@@ -367,6 +380,65 @@ def test_a_repetition_whose_commit_was_lost_is_answered_with_the_first_answer(sq
     assert (again.intent.id, again.replayed) == (first.intent.id, b"1")
 
 
+def cut(location: str, *, after_commit: bool) -> Callable[[Connection], None]:
+    """Return a handler for which somebody cuts the connection at the server."""
+
+    def handler(connection: Connection) -> None:
+        pid = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
+        if after_commit:
+            connection.connection.commit()
+        with database(location) as somebody:
+            assert somebody.rows("SELECT pg_terminate_backend(?, 5000)", [pid]) == [(True,)]
+
+    return handler
+
+
+@on_postgresql
+def test_requests_whose_connection_was_cut_before_the_commit_are_told_that_nothing_was_recorded(
+    square: Process,
+) -> None:
+    with on_commit(cut(square.location, after_commit=False)):
+        answers = outcomes(square, *[SQUARE.submission("N", "S") for _ in range(3)])
+    assert [type(answer) for answer in answers] == [LedgerUnavailable] * 3
+    assert square.submit(SQUARE.submission("N", "S")).sequence == 1
+    assert_sound(square)
+
+
+@on_postgresql
+def test_a_request_whose_connection_was_cut_after_the_commit_is_answered_from_the_ledger(square: Process) -> None:
+    with on_commit(cut(square.location, after_commit=True)):
+        first = square.submit(SQUARE.submission("N", "S"))
+    assert (first.sequence, held(first)) == (1, set(reserved(square.location)))
+    assert square.submit(SQUARE.submission("S", "N")).sequence == 2
+    assert_sound(square)
+
+
+@on_postgresql
+def test_a_connection_that_was_cut_between_two_requests_is_made_again_for_the_second(square: Process) -> None:
+    square.submit(SQUARE.submission("N", "S"))
+    with database(square.location) as somebody:
+        others = "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity WHERE datname = current_database()"
+        assert (True,) in somebody.rows(f"{others} AND pid <> pg_backend_pid()")
+    assert square.submit(SQUARE.submission("S", "N")).sequence == 2
+    assert_sound(square)
+
+
+@on_postgresql
+def test_a_commit_is_durable_before_its_answer_whatever_the_server_does_by_default(
+    ledger: str, clock: FakeClock
+) -> None:
+    with database(ledger) as somebody:
+        somebody.execute(f"ALTER DATABASE {urlsplit(ledger).path[1:]} SET synchronous_commit = off")
+    waits: list[str] = []
+    with (
+        Process(ledger, SQUARE.airspace, clock) as process,
+        on_commit(lambda connection: waits.append(connection.exec_driver_sql("SHOW synchronous_commit").scalar_one())),
+    ):
+        process.submit(SQUARE.submission("N", "S"))
+    assert waits == ["on"]
+
+
+@on_sqlite
 def test_a_full_disk_fails_the_whole_batch_and_leaves_nothing_of_it(square: Process) -> None:
     square.submit(SQUARE.submission("N", "S"))
     small = SQUARE.submission("N", "S")
@@ -409,7 +481,7 @@ def test_an_unexpected_error_in_one_request_harms_neither_its_neighbours_nor_the
 
 def test_a_request_that_is_given_up_while_it_is_planned_does_not_stop_the_writer(square: Process) -> None:
     async def give_up() -> Outcome:
-        with write_lock(square.path):
+        with write_lock(square.location):
             given_up = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
             last = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("S", "N")))
             await until(lambda: square.deconfliction.waiting == 1)
@@ -425,7 +497,7 @@ def test_a_request_that_is_given_up_while_it_is_planned_does_not_stop_the_writer
 
 def test_a_request_that_is_given_up_in_the_queue_does_not_stop_the_writer(square: Process) -> None:
     async def give_up() -> Outcome:
-        with write_lock(square.path):
+        with write_lock(square.location):
             first = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
             given_up = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
             last = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("S", "N")))
@@ -453,7 +525,7 @@ def test_a_request_to_a_writer_that_has_stopped_is_refused_at_once(square: Proce
 
 def test_stopping_finishes_what_waits(square: Process) -> None:
     async def stop_meanwhile() -> list[Outcome]:
-        with write_lock(square.path):
+        with write_lock(square.location):
             tasks = [asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S"))) for _ in range(3)]
             await until(lambda: square.deconfliction.waiting == 2)
             stopping = asyncio.create_task(asyncio.to_thread(square.deconfliction.stop))
@@ -464,12 +536,12 @@ def test_stopping_finishes_what_waits(square: Process) -> None:
     assert [outcome.intent.sequence for outcome in asyncio.run(stop_meanwhile())] == [1, 2, 3]
 
 
-def test_a_full_queue_takes_nothing(ledger_path: Path, clock: FakeClock) -> None:
+def test_a_full_queue_takes_nothing(ledger: str, clock: FakeClock) -> None:
     policy = Policy(POLICY.horizon_ms, POLICY.idempotency_ms, queue_limit=1)
-    with Process(ledger_path, SQUARE.airspace, clock, policy=policy) as process:
+    with Process(ledger, SQUARE.airspace, clock, policy=policy) as process:
 
         async def overfill() -> list[Outcome]:
-            with write_lock(process.path):
+            with write_lock(process.location):
                 first = asyncio.create_task(process.deconfliction.submit(SQUARE.submission("N", "S")))
                 await asyncio.sleep(0)
                 await until(lambda: process.deconfliction.waiting == 0)
@@ -535,7 +607,7 @@ def test_cancelling_twice_changes_nothing_the_second_time(square: Process) -> No
     first = square.cancel(intent)
     second = square.cancel(intent)
     assert (second.state, second.version) == (State.CANCELLED, first.version)
-    assert_gapless(square.path)
+    assert_gapless(square.location)
 
 
 def test_a_refused_intent_cannot_be_cancelled(street: Process) -> None:
@@ -615,8 +687,8 @@ def test_duplicates_in_one_batch_make_one_intent(square: Process) -> None:
     assert len(square.ledger.everything()[0]) == 1
 
 
-def test_a_key_outlives_the_process(ledger_path: Path, clock: FakeClock) -> None:
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+def test_a_key_outlives_the_process(ledger: str, clock: FakeClock) -> None:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         submit(process)
-    with Process(ledger_path, SQUARE.airspace, clock) as process:
+    with Process(ledger, SQUARE.airspace, clock) as process:
         assert submit(process).replayed == b"1"

@@ -6,6 +6,7 @@ requests were answered over HTTP; and again after a restart.
 
 import random
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from planner.airspace import Airspace
 from planner.errors import Block
 from planner.separation import CheckedFlight, Report, verify
 from tests.api.bodies import SUBMIT, intent
-from tests.api.serving import Client, served
+from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import START_MS, district
 from tests.ledger.process import FakeClock, assert_gapless, assert_no_overlaps
 
@@ -72,13 +73,10 @@ def checked(intent: FlightIntent) -> CheckedFlight:
     return CheckedFlight(intent.id, path.block, path.arrive_ms, path.depart_ms, held.block, held.enter_ms, held.exit_ms)
 
 
-def verified(ledger: Path, airspace: Airspace) -> Report:
+def verified(ledger: str, airspace: Airspace) -> Report:
     """Return what the checker says of a ledger's accepted flights."""
-    opened = open_ledger(str(ledger), airspace)
-    try:
+    with closing(open_ledger(ledger, airspace)) as opened:
         return verify(airspace, [checked(found) for found in opened.everything()[0] if found.state == "accepted"])
-    finally:
-        opened.close()
 
 
 def submit_at_random(client: Client, chance: random.Random) -> list[dict[str, Any]]:
@@ -98,14 +96,13 @@ def submit_at_random(client: Client, chance: random.Random) -> list[dict[str, An
 
 
 @pytest.fixture
-def city(tmp_path: Path) -> Settings:
-    CITY.airspace.write(tmp_path / "airspace.json")
-    return Settings(ledger=str(tmp_path / "ledger.sqlite"), airspace=tmp_path / "airspace.json")
+def city(ledger: str, tmp_path: Path) -> Settings:
+    return settings_for(CITY, ledger, tmp_path)
 
 
 def test_a_busy_district_stays_separated_also_after_a_restart(city: Settings, clock: FakeClock) -> None:
     chance = random.Random(1)
-    ledger = Path(city.ledger)
+    ledger = city.ledger
     with served(create_app(city, clock)) as client:
         before = submit_at_random(client, chance)
         states = Counter(item["state"] for item in client.get(SUBMIT, params={"limit": "500"}).json()["items"])

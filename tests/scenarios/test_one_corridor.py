@@ -13,11 +13,10 @@ import httpx
 import pytest
 
 from app.main import create_app
-from app.settings import Settings
 from app.times import parse_time
 from planner.separation import verify
 from tests.api.bodies import SUBMIT, intent, problem
-from tests.api.serving import Client, served
+from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import STREET
 from tests.ledger.process import FakeClock, assert_gapless, assert_no_overlaps
 from tests.scenarios.test_busy_district import checked
@@ -26,10 +25,8 @@ CLIENTS, FLIGHTS = 8, 6
 
 
 @pytest.fixture
-def street(tmp_path: Path, clock: FakeClock) -> Iterator[Client]:
-    STREET.airspace.write(tmp_path / "airspace.json")
-    settings = Settings(ledger=str(tmp_path / "ledger.sqlite"), airspace=tmp_path / "airspace.json")
-    with served(create_app(settings, clock)) as client:
+def street(ledger: str, tmp_path: Path, clock: FakeClock) -> Iterator[Client]:
+    with served(create_app(settings_for(STREET, ledger, tmp_path), clock)) as client:
         yield client
 
 
@@ -37,7 +34,7 @@ def ask(client: Client, origin: str, destination: str, **members: Any) -> httpx.
     return client.post(SUBMIT, json=intent(origin, destination, district=STREET, **members))
 
 
-def test_eight_operators_racing_for_one_corridor_get_it_one_after_the_other(street: Client, tmp_path: Path) -> None:
+def test_eight_operators_racing_for_one_corridor_get_it_one_after_the_other(street: Client, ledger: str) -> None:
     answers: list[httpx.Response] = []
     barrier = threading.Barrier(CLIENTS)
 
@@ -59,8 +56,8 @@ def test_eight_operators_racing_for_one_corridor_get_it_one_after_the_other(stre
     assert planned[0]["delay_s"] == 0.0
     report = verify(STREET.airspace, [checked(found) for found in street.service.ledger.everything()[0]])
     assert report.violations == ()
-    assert_no_overlaps(tmp_path / "ledger.sqlite")
-    assert_gapless(tmp_path / "ledger.sqlite")
+    assert_no_overlaps(ledger)
+    assert_gapless(ledger)
 
 
 def test_flights_against_each_other_are_never_in_the_street_together(street: Client) -> None:

@@ -1,0 +1,142 @@
+"""`airmatrix serve`: the service, in one process or several that share a port and a ledger."""
+
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import structlog
+import typer
+import uvicorn
+
+from app import auth, logs, service
+from app.errors import RequestError, StartupError
+from app.ledger import parse_location
+from app.main import create_app
+from app.metrics import forget_process
+from app.service import Basis
+from app.settings import Settings
+from app.times import now_ms
+from app.workers import Workers
+from planner.errors import PlannerError
+
+log = structlog.get_logger()
+
+_GRACE_S = 5
+_REFUSED, _WRITER_DIED, _INTERRUPTED = 2, 70, 130
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.  [default: 127.0.0.1]")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; 0 for any.  [default: 8000]")] = None,
+    ledger: Annotated[str | None, typer.Option(help="Ledger file or URL, created if absent.")] = None,
+    airspace: Annotated[Path | None, typer.Option(help="Airspace file. Default: the shipped one.")] = None,
+    aircraft_types: Annotated[Path | None, typer.Option(help="TOML file of further aircraft types.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=64, help="Processes that share the port and the ledger.  [default: 1]")
+    ] = None,
+    read_only: Annotated[
+        bool | None, typer.Option("--read-only", help="Answer reads only, of a ledger that others write.")
+    ] = None,
+) -> None:
+    """Serve the API. Every option, and every other setting, is also an AIRMATRIX_* variable."""
+    settings = Settings.given(
+        host=host,
+        port=port,
+        ledger=ledger,
+        airspace=airspace,
+        aircraft_types=aircraft_types,
+        workers=workers,
+        read_only=read_only,
+    )
+    logs.configure(settings)
+    auth.check_listening(settings)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    # Taken before anything is created; who connects early waits until everything is ready.
+    with _listen(settings.host, settings.port) as listener:
+        basis = service.prepare(settings)
+        if settings.allow_unauthenticated:
+            log.warning("AIRMATRIX_ALLOW_UNAUTHENTICATED: anybody who reaches this address can plan and cancel flights")
+        announce = partial(_announce, settings, listener)
+        if settings.workers == 1:
+            _work(basis, listener, announce)
+        else:
+            _supervise(basis, listener, announce)
+
+
+def _supervise(basis: Basis, listener: socket.socket, announce: Callable[[], None]) -> None:
+    """Run workers until a signal comes."""
+    workers = Workers(basis.settings.workers, partial(_worker, basis.settings, basis.fingerprint, listener))
+    with TemporaryDirectory(prefix="airmatrix-metrics-") as folder:
+        # Where the workers add up their metrics.
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
+        received = workers.run(on_ready=announce, on_death=forget_process)
+    if received is signal.SIGINT:
+        raise typer.Exit(_INTERRUPTED)
+
+
+def _worker(settings: Settings, fingerprint: str, listener: socket.socket, ready: Callable[[], None]) -> None:
+    """Be one of several processes, which must not differ in what they know."""
+    logs.configure(settings)
+    structlog.configure(processors=[_name_worker, *structlog.get_config()["processors"]])
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    try:
+        _work(service.reread_basis(settings, fingerprint), listener, ready)
+    except (StartupError, PlannerError, RequestError) as error:
+        log.critical("worker cannot start", error=str(error))
+        sys.exit(_REFUSED)
+
+
+def _work(basis: Basis, listener: socket.socket, ready: Callable[[], None]) -> None:
+    """Serve in this process until a signal comes, or the writer dies."""
+    died = threading.Event()
+
+    def end() -> None:
+        died.set()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    # uvicorn ends by raising the signal that stopped it; a clean exit still closes the ledger.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(_WRITER_DIED if died.is_set() else 0))
+    with service.started(basis, now_ms, on_death=end) as running:
+        config = uvicorn.Config(
+            create_app(basis.settings, running=running),
+            access_log=False,
+            log_config=None,
+            timeout_graceful_shutdown=_GRACE_S,
+        )
+        ready()
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def _announce(settings: Settings, listener: socket.socket) -> None:
+    address, port = listener.getsockname()[:2]
+    url = f"http://{f'[{address}]' if ':' in address else address}:{port}"
+    mode = {"mode": "read-only"} if settings.read_only else {}
+    log.info("ready", ledger=str(parse_location(settings.ledger)), workers=settings.workers, **mode)
+    log.info("listening", url=url, docs=f"{url}/docs")
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host.removeprefix("[").removesuffix("]"), port))
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise StartupError(f"cannot listen on {host}:{port}: {error.strerror}; choose another with --port") from error
+    return listener
+
+
+def _name_worker(
+    _logger: object, _method: str, event: structlog.typing.EventDict
+) -> structlog.typing.ProcessorReturnValue:
+    event["worker"] = os.getpid()
+    return event

@@ -1,0 +1,143 @@
+"""A ledger in a SQLite file."""
+
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import Connection, Engine, create_engine, event
+
+from app.errors import ForeignLedger, LedgerMissing, StartupError
+from app.ledger.location import Location
+from app.ledger.rows import HeldReservations
+
+# "AMTX": marks a SQLite file as a ledger of ours.
+APPLICATION_ID = 0x414D5458
+# In a SQLite header: where it stands whether the database is in WAL mode, and how.
+_WRITE_VERSION, _WAL = 18, 2
+_WAIT_S = 10.0
+# SQLite's own way of waiting sleeps up to a tenth of a second, and so lets the same process win the lock over and over.
+_POLL_S = 0.001
+# As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
+_READERS = 40
+# A flight's reservations lie all over the table, so its pages had better stay in memory (KiB), and be copied from the
+# log to the file only now and then (pages).
+_WRITER_CACHE_KIB = 64 * 1024
+_CHECKPOINT_PAGES = 10_000
+
+
+class SqliteDatabase:
+    """One SQLite file in WAL mode: readers never wait for the writer, nor the writer for them."""
+
+    name = "sqlite"
+
+    def __init__(self, location: Location) -> None:
+        self.location = location
+        self._path = location.path
+
+    def create(self) -> None:
+        """Make a ledger, as yet without tables, of an absent or empty file.
+
+        Raises
+        ------
+        LedgerMissing, ForeignLedger, StartupError
+        """
+        path = self._path
+        if not path.parent.is_dir():
+            raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
+        if not path.exists() or path.stat().st_size == 0 or _check_is_ledger(path)[_WRITE_VERSION] != _WAL:
+            _mark(path)
+
+    def check(self) -> None:
+        """Raise `LedgerMissing` or `ForeignLedger` unless there is a ledger of ours."""
+        if not self._path.exists() or self._path.stat().st_size == 0:
+            raise LedgerMissing(f"there is no ledger at {self._path}; `airmatrix serve` creates one")
+        _check_is_ledger(self._path)
+
+    def check_tables(self, connection: Connection, *, may_be_empty: bool) -> None:
+        """Do nothing: the file's header has said what it is."""
+
+    def engine(self, *, writes: bool, migrates: bool = False) -> Engine:
+        """Return an engine whose transactions hold the write lock from the start, or cannot write at all."""
+        del migrates  # There is one lock only.
+        engine = create_engine(
+            self.location.url,
+            pool_size=1 if writes else _READERS,
+            max_overflow=0,
+            connect_args={"timeout": _WAIT_S, "check_same_thread": False, "isolation_level": None},
+        )
+
+        @event.listens_for(engine, "connect")
+        def configure(connection: sqlite3.Connection, _record: object) -> None:
+            connection.execute("PRAGMA synchronous = FULL")
+            connection.execute("PRAGMA foreign_keys = ON")
+            connection.execute(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
+            if writes:
+                connection.execute(f"PRAGMA cache_size = -{_WRITER_CACHE_KIB}")
+                connection.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
+                # From here on `_begin_immediate` waits instead.
+                connection.execute("PRAGMA busy_timeout = 0")
+
+        @event.listens_for(engine, "begin")
+        def begin(connection: Connection) -> None:
+            if writes:
+                _begin_immediate(connection)
+            else:
+                connection.exec_driver_sql("BEGIN")
+
+        return engine
+
+    def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
+        """Insert reservations, by driver: a hundred rows an intent are the hot path."""
+        rows = np.column_stack([held.block, held.enter_ms, held.exit_ms, held.sequence]).tolist()
+        connection.exec_driver_sql(
+            'INSERT INTO reservations (block, enter, "exit", intent) VALUES (?, ?, ?, ?)', [tuple(row) for row in rows]
+        )
+
+
+def _begin_immediate(connection: Connection) -> None:
+    give_up = time.monotonic() + _WAIT_S
+    driver = connection.connection.driver_connection
+    assert isinstance(driver, sqlite3.Connection)
+    while True:
+        try:
+            driver.execute("BEGIN IMMEDIATE")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
+                # Once more through SQLAlchemy, for an exception of its own.
+                connection.exec_driver_sql("BEGIN IMMEDIATE")
+                return
+        else:
+            return
+        time.sleep(_POLL_S)
+
+
+def _mark(path: Path) -> None:
+    """Make an empty file a ledger; the mark comes first, so that one whose creation was cut short is still one."""
+    give_up = time.monotonic() + _WAIT_S
+    while True:
+        try:
+            with closing(sqlite3.connect(path, timeout=_WAIT_S, isolation_level=None)) as connection:
+                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+                connection.execute("PRAGMA journal_mode = WAL")
+                return
+        except sqlite3.Error as error:
+            # SQLite does not wait for others by itself when it changes the journal mode.
+            if getattr(error, "sqlite_errorcode", None) != sqlite3.SQLITE_BUSY or time.monotonic() > give_up:
+                raise StartupError(f"cannot create ledger {path}: {error}") from error
+        time.sleep(_POLL_S)
+
+
+def _check_is_ledger(path: Path) -> bytes:
+    """Return the file's header, read without SQLite, which may write beside a database that it merely opens."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(100)
+    except OSError as error:
+        raise ForeignLedger(f"cannot read ledger {path}: {error.strerror}") from error
+    if not header.startswith(b"SQLite format 3\0"):
+        raise ForeignLedger(f"{path} is not an AirMatrix ledger; nothing was changed in it")
+    if int.from_bytes(header[68:72]) != APPLICATION_ID:
+        raise ForeignLedger(f"{path} is a SQLite database, but not an AirMatrix ledger; nothing was changed in it")
+    return header

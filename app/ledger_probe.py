@@ -1,0 +1,42 @@
+"""Asking a ledger that may not answer."""
+
+import asyncio
+from concurrent.futures import Future
+from threading import Thread
+
+from app.errors import LedgerUnavailable
+from app.ledger import Ledger
+
+_PATIENCE_S = 2.0
+
+
+class LedgerProbe:
+    """Reads the newest revision for health checks: never for long, and never with more than one thread.
+
+    The thread is none of those that serve requests, which a ledger that hangs may hold all; and a process may end
+    while it waits.
+    """
+
+    def __init__(self, ledger: Ledger, patience_s: float = _PATIENCE_S) -> None:
+        self._ledger = ledger
+        self._patience_s = patience_s
+        self._asked: Future[int] | None = None
+
+    async def revision(self) -> int:
+        """Return the ledger's newest revision; `LedgerUnavailable` if it cannot be read, or not in time."""
+        if self._asked is None or self._asked.done():
+            self._asked = Future()
+            Thread(target=self._ask, args=(self._asked,), name="ledger-probe", daemon=True).start()
+        try:
+            # Shielded: who asks next waits for the same answer.
+            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(self._asked)), self._patience_s)
+        except TimeoutError:
+            raise LedgerUnavailable(
+                f"the ledger cannot be read: it has not answered within {self._patience_s:g} s"
+            ) from None
+
+    def _ask(self, asked: "Future[int]") -> None:
+        try:
+            asked.set_result(self._ledger.revision())
+        except Exception as error:
+            asked.set_exception(error)
