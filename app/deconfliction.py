@@ -336,8 +336,8 @@ class Deconfliction:
         answers: Sequence[object]
         transaction: Transaction | None = None
         try:
+            self._see_to_trouble(taken)
             answers, transaction = self._write(taken)
-            self.trouble = None
         except CommitUncertain as error:
             failure = error
             answers = self._look_up(taken)
@@ -369,6 +369,14 @@ class Deconfliction:
             _log_batch(report)
         with suppress(OSError, ValueError):
             self._observe(report)
+
+    def _see_to_trouble(self, taken: list[Request]) -> None:
+        """If the ledger failed, ask it again; in vain: take all that wait, and raise `LedgerUnavailable`."""
+        if self.trouble is not None:
+            self._keep_house()
+        if self.trouble is not None:
+            taken += self._waiting()
+            raise LedgerUnavailable(f"{self.trouble}; nothing was recorded")
 
     def _write(self, taken: list[Request]) -> tuple[list[object], Transaction]:
         """Run the requests in one transaction; return their answers, and the transaction.
@@ -405,17 +413,24 @@ class Deconfliction:
         """Yield the request in `taken`, then append and yield waiting ones until the batch is full."""
         yield taken[0]
         until = time.perf_counter() + BATCH_PLANNING_S
-        while len(taken) < BATCH_REQUESTS and time.perf_counter() < until:
+        for request in self._waiting():
+            taken.append(request)
+            yield request
+            if len(taken) == BATCH_REQUESTS or time.perf_counter() > until:
+                return
+
+    def _waiting(self) -> Iterator[Request]:
+        """Take and yield the requests that wait; from then on nobody can give them up, so their answers have a place
+        to go.
+        """
+        while not self._stopping:
             try:
                 request = self._queue.get_nowait()
             except queue.Empty:
                 return
             if request is None:
                 self._stopping = True
-                return
-            # From here on nobody can give it up, so that its answer has a place to go.
-            if request.future.set_running_or_notify_cancel():
-                taken.append(request)
+            elif request.future.set_running_or_notify_cancel():
                 yield request
 
     def _run(self, request: Request, transaction: Transaction, now: int) -> object:

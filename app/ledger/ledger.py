@@ -121,7 +121,7 @@ class Ledger:
                 connection.commit()
             except DBAPIError as error:
                 connection.invalidate()
-                raise CommitUncertain(cause_of(error)) from error
+                raise CommitUncertain(f"the commit failed: {cause_of(error)}") from error
             transaction.commit_s = time.perf_counter() - began
         finally:
             connection.close()

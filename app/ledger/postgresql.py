@@ -12,11 +12,20 @@ from app.ledger.rows import HeldReservations
 _LOCKS = 0x414D5458
 # As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
 _READERS = 40
-_CONNECT_S = 5
+# A server that does not answer is given up after some seconds, not when TCP gives up.
+_CONNECT = {
+    "connect_timeout": 5,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 10_000,
+    "application_name": "airmatrix",
+}
 # Whoever writes waits this long for the lock; a process that freezes with the lock in its hands loses it after this.
 _LOCK = "10s"
 _IDLE = "30s"
-_STATEMENT = "30s"
+# Whoever reads has this long; loading the index may take longer.
+_READ = "30s"
 
 
 class PostgresqlDatabase:
@@ -57,7 +66,7 @@ class PostgresqlDatabase:
             # Restarts of the server show here, not in the first request after them.
             pool_pre_ping=True,
             isolation_level="READ COMMITTED" if writes else "REPEATABLE READ",
-            connect_args={"connect_timeout": _CONNECT_S, "application_name": "airmatrix"},
+            connect_args=_CONNECT,
             execution_options={} if writes else {"postgresql_readonly": True},
         )
 
@@ -66,8 +75,8 @@ class PostgresqlDatabase:
             with connection.cursor() as cursor:
                 cursor.execute(f"SET lock_timeout = '{_LOCK}'")
                 cursor.execute(f"SET idle_in_transaction_session_timeout = '{_IDLE}'")
-                if not migrates:
-                    cursor.execute(f"SET statement_timeout = '{_STATEMENT}'")
+                if not writes:
+                    cursor.execute(f"SET statement_timeout = '{_READ}'")
                 # A 201 is sent after the commit is durable, whatever the server's default.
                 cursor.execute(
                     "SELECT set_config('synchronous_commit', 'on', false)"

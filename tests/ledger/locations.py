@@ -147,7 +147,10 @@ def content(location: str | Path) -> object:
     """
     if "://" not in str(location):
         return {file.name: file.read_bytes() for file in Path(location).parent.iterdir() if file.is_file()}
-    tables = "SELECT oid::regclass::text FROM pg_class WHERE relkind = 'r' AND NOT relisshared AND relname <> ?"
+    tables = (
+        "SELECT oid::regclass::text FROM pg_class"
+        " WHERE relkind = 'r' AND NOT relisshared AND relname <> ? AND has_table_privilege(oid, 'SELECT')"
+    )
     rows = "SELECT md5(string_agg(ctid::text || xmin::text, ' ' ORDER BY ctid)) FROM "
     with database(location) as connection:
         # The server writes statistics by itself.

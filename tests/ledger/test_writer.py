@@ -301,6 +301,27 @@ def test_after_a_commit_that_failed_the_service_goes_on_as_if_it_had_not_been_tr
     assert_sound(square)
 
 
+def test_while_the_ledger_fails_nobody_waits_for_it(square: Process) -> None:
+    with on_commit(fail):
+        with pytest.raises(LedgerUnavailable):
+            square.submit(SQUARE.submission("N", "S"))
+        asyncio.run(until(lambda: square.deconfliction.trouble is not None))
+        failed = outcomes(square, *[SQUARE.submission("N", "S") for _ in range(100)])
+    assert [type(answer) for answer in failed] == [LedgerUnavailable] * 100
+    assert "the commit failed: the connection was lost; nothing was recorded" in str(failed[-1])
+    assert len(square.ledger.everything()[0]) == 0
+
+
+def test_the_writer_notices_by_itself_that_the_ledger_can_be_written_again(square: Process) -> None:
+    with on_commit(fail):
+        with pytest.raises(LedgerUnavailable):
+            square.submit(SQUARE.submission("N", "S"))
+        asyncio.run(until(lambda: square.deconfliction.trouble is not None))
+    asyncio.run(until(lambda: square.deconfliction.trouble is None))
+    assert square.submit(SQUARE.submission("N", "S")).sequence == 1
+    assert_sound(square)
+
+
 @contextmanager
 def broken_log() -> Iterator[None]:
     """Let every attempt to log fail, as it does when the log's disk is full."""
@@ -319,6 +340,7 @@ def test_a_log_that_cannot_be_written_stops_nothing_and_reserves_nothing_twice(s
         first = street.submit(STREET.submission("W", "E"))
         with on_commit(fail), pytest.raises(LedgerUnavailable):
             street.submit(STREET.submission("W", "E"))
+        asyncio.run(until(lambda: street.deconfliction.trouble is None))
         with on_commit(commit_and_fail):
             second = street.submit(STREET.submission("W", "E"))
     assert (first.sequence, second.sequence) == (1, 2)
