@@ -50,6 +50,8 @@ _CATCH_UP_ENTRIES = 1_000
 _STEP_BACK_MS = 10_000
 # How long the ledger is asked, and how often, what became of a commit.
 _LOOK_UP_S, _RETRY_S = 10.0, 0.1
+# A ledger that failed counts as well again after a batch, or if it can be written for so long without one that fails.
+_CALM_S = 2.0
 # Without requests the writer wakes up this often; while there is something to remove, this often.
 _IDLE_S, _PAUSE_S = 1.0, 0.01
 # How often retention looks for what has passed; and how much it removes at once, so that nobody waits long for it.
@@ -175,6 +177,7 @@ class Deconfliction:
         self._forgotten_ms = 0
         self._kept_house_ms = 0
         self._pause_s = _IDLE_S
+        self._failed = 0.0
         self._stopping = False
         self._open = threading.Lock()
         self._closed = False
@@ -338,17 +341,18 @@ class Deconfliction:
         try:
             self._see_to_trouble(taken)
             answers, transaction = self._write(taken)
+            self.trouble = None
         except CommitUncertain as error:
             failure = error
+            self._fail(error)
             answers = self._look_up(taken)
-            self.trouble = str(error)
         except Exception as error:
             failure = error
+            self._fail(error)
             known = isinstance(error, LedgerUnavailable)
             answers = [error if known else LedgerUnavailable("the ledger writer failed; nothing was recorded")] * len(
                 taken
             )
-            self.trouble = str(error) if known else repr(error)
         for request, answer in zip(taken, answers, strict=True):
             if isinstance(answer, BaseException):
                 request.future.set_exception(answer)
@@ -372,11 +376,27 @@ class Deconfliction:
 
     def _see_to_trouble(self, taken: list[Request]) -> None:
         """If the ledger failed, ask it again; in vain: take all that wait, and raise `LedgerUnavailable`."""
-        if self.trouble is not None:
-            self._keep_house()
-        if self.trouble is not None:
+        if self.trouble is not None and not self._probe():
             taken += self._waiting()
             raise LedgerUnavailable(f"{self.trouble}; nothing was recorded")
+
+    def _probe(self) -> bool:
+        """Tell whether the ledger can be written. That ends the trouble only after a while: on a full disk there is
+        often still room for this, but not for a batch.
+        """
+        try:
+            with self._ledger.transaction() as transaction:
+                transaction.touch()
+        except Exception as error:
+            self._fail(error)
+            return False
+        if time.monotonic() - self._failed >= _CALM_S:
+            self.trouble = None
+        return True
+
+    def _fail(self, error: Exception) -> None:
+        self.trouble = str(error) if isinstance(error, LedgerUnavailable | CommitUncertain) else repr(error)
+        self._failed = time.monotonic()
 
     def _write(self, taken: list[Request]) -> tuple[list[object], Transaction]:
         """Run the requests in one transaction; return their answers, and the transaction.
@@ -485,35 +505,32 @@ class Deconfliction:
 
     def _keep_house(self) -> None:
         """Between batches: see whether the ledger can be written again, and remove a little of what has passed."""
-        now = self._watermark_ms
-        due = self._policy.retention_ms is not None and abs(now - self._kept_house_ms) >= _HOUSE_MS
-        if self.trouble is None and not due:
+        if self.trouble is not None:
+            self._probe()
             return
-        removed = 0
+        now = self._watermark_ms
+        if self._policy.retention_ms is None or abs(now - self._kept_house_ms) < _HOUSE_MS:
+            return
         try:
             with self._ledger.transaction() as transaction:
-                removed = self._remove_passed(transaction, now)
-                if self.trouble is not None:
-                    transaction.touch()
-            self.trouble = None
+                removed = self._remove_passed(transaction, now, self._policy.retention_ms)
         except Exception as error:
-            self.trouble = str(error)
+            self._fail(error)
+            return
         # As long as there is more to remove, after every batch.
         self._pause_s = _PAUSE_S if removed else _IDLE_S
         if not removed:
             self._kept_house_ms = now
 
-    def _remove_passed(self, transaction: Transaction, now: int) -> int:
+    def _remove_passed(self, transaction: Transaction, now: int, retention_ms: int) -> int:
         """Remove some of what retention lets go, and return how much."""
-        newest_ms = transaction.newest_journal_time()
-        if self._policy.retention_ms is None or newest_ms is None:
-            return 0
-        # Counted from what the ledger has seen, so that a clock that is wrong removes nothing by itself.
-        now = min(now, newest_ms)
-        before_ms = now - self._policy.retention_ms
-        transaction.forget_answers(now - self._policy.idempotency_ms)
+        self._forget_answers(transaction, now)
+        before_ms = transaction.seen(now) - retention_ms
         removed = transaction.remove_ended(before_ms, _REMOVE_INTENTS)
         return removed + transaction.remove_journal(before_ms, _REMOVE_ENTRIES)
+
+    def _forget_answers(self, transaction: Transaction, now: int) -> None:
+        transaction.forget_answers(transaction.seen(now) - self._policy.idempotency_ms)
 
     def _catch_up(self, transaction: Transaction, now: int, revision: int | None) -> None:
         """Bring the index from a revision (None: from nothing) to the transaction's; drop what has passed."""
@@ -565,7 +582,7 @@ class Deconfliction:
         self, transaction: Transaction, now: int, intent_id: str, submission: Submission, key: IdempotencyKey | None
     ) -> Outcome:
         if key is not None:
-            transaction.forget_answers(now - self._policy.idempotency_ms)
+            self._forget_answers(transaction, now)
             first = transaction.answer_to(submission.operator, key.key)
             if first is not None and first.body_digest != key.body_digest:
                 raise IdempotencyKeyReused(

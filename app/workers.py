@@ -59,11 +59,16 @@ class Workers:
         self._due: list[float] = []
         self._announced = False
 
-    def run(self, on_ready: Callable[[], None], on_death: Callable[[int], None] = lambda _: None) -> signal.Signals:
+    def run(
+        self,
+        on_ready: Callable[[], None],
+        on_death: Callable[[int], None] = lambda _: None,
+        on_stop: Callable[[], None] = lambda: None,
+    ) -> signal.Signals:
         """Run the workers until SIGTERM or SIGINT comes, stop them, and return which it was. For the main thread.
 
-        `on_ready` is called when all are ready for the first time, `on_death` with the process id of each that died.
-        Raises `StartupError` if one dies before.
+        `on_ready` is called when all are ready for the first time, `on_death` with the process id of each that died,
+        `on_stop` before they are stopped. Raises `StartupError` if one dies before all are ready.
         """
         self._due = [time.monotonic()] * self._count
         with _caught(signal.SIGTERM, signal.SIGINT) as caught:
@@ -79,6 +84,7 @@ class Workers:
                         self._announced = True
                         on_ready()
             finally:
+                on_stop()
                 self._stop()
 
     def _start_due(self) -> None:
@@ -182,8 +188,9 @@ def _run(work: Work, pulse: Connection) -> None:
 def _beat(pulse: Connection, ready: threading.Event) -> None:
     with closing(pulse), suppress(OSError):
         while True:
-            pulse.send(ready.is_set())
-            if ready.is_set():
+            is_ready = ready.is_set()
+            pulse.send(is_ready)
+            if is_ready:
                 time.sleep(_PULSE_S)
             else:
                 ready.wait(_PULSE_S)

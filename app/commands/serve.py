@@ -76,7 +76,7 @@ def _supervise(basis: Basis, listener: socket.socket, announce: Callable[[], Non
     with TemporaryDirectory(prefix="airmatrix-metrics-") as folder:
         # Where the workers add up their metrics.
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
-        received = workers.run(on_ready=announce, on_death=forget_process)
+        received = workers.run(on_ready=announce, on_death=forget_process, on_stop=listener.close)
     if received is signal.SIGINT:
         raise typer.Exit(_INTERRUPTED)
 

@@ -7,7 +7,7 @@ sees everything committed before it, so `sequence` and `revision` are gapless an
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import takewhile
 from typing import Any
@@ -119,12 +119,14 @@ class Ledger:
             began = time.perf_counter()
             try:
                 connection.commit()
-            except DBAPIError as error:
+                transaction.commit_s = time.perf_counter() - began
+            except Exception as error:
                 connection.invalidate()
                 raise CommitUncertain(f"the commit failed: {cause_of(error)}") from error
-            transaction.commit_s = time.perf_counter() - began
         finally:
-            connection.close()
+            # From the commit on, nothing that fails may look as if nothing had been written.
+            with suppress(Exception):
+                connection.close()
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -416,11 +418,14 @@ class Transaction:
             self._connection.execute(delete(journal).where(journal.c.revision <= old[-1].revision))
         return len(old)
 
-    def newest_journal_time(self) -> int | None:
-        """Return when the newest change was recorded, None if there has been none."""
-        self.flush()
+    def seen(self, now_ms: int) -> int:
+        """Return a process's `now`, or when the newest change was recorded if that is earlier.
+
+        What is old is old by both: a clock that is wrong makes nothing old by itself.
+        """
         query = select(journal.c.time).order_by(journal.c.revision.desc()).limit(1)
-        return self._connection.execute(query).scalar_one_or_none()
+        newest_ms = self._connection.execute(query).scalar_one_or_none()
+        return 0 if newest_ms is None else min(now_ms, newest_ms)
 
     def touch(self) -> None:
         """Write something that changes nothing: a commit that succeeds proves that the ledger can be written."""

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
-from threading import Event, current_thread
+from threading import Event, Thread, current_thread
 from threading import enumerate as all_threads
 from typing import Any
 
@@ -201,8 +201,8 @@ def hanging() -> Iterator[Event]:
         event.remove(Engine, "begin", hang)
 
 
-def probing_threads() -> int:
-    return [thread.name for thread in all_threads()].count("ledger-probe")
+def probing_threads() -> list[Thread]:
+    return [thread for thread in all_threads() if thread.name == "ledger-probe"]
 
 
 def test_a_ledger_that_hangs_holds_no_health_check_and_no_more_than_one_thread_of_them(
@@ -220,13 +220,15 @@ def test_a_ledger_that_hangs_holds_no_health_check_and_no_more_than_one_thread_o
                         "the ledger cannot be read: it has not answered within 0.05 s", 0, None
                     )  # fmt: skip
                 assert not_ready(await http.get("/health/ready"))
-                assert probing_threads() == 1
+                (probing,) = probing_threads()
+                # Not even the end of the process waits for it.
+                assert probing.daemon
                 for path in ("/health/live", "/version", "/metrics"):
                     assert (await http.get(path)).status_code == 200
                 assert not any(read.done() for read in reads)
                 answers.set()
                 assert {(await read).status_code for read in reads} == {200}
-            await until(lambda: probing_threads() == 0)
+            await until(lambda: not probing_threads())
             assert (await http.get("/health/ready")).status_code == 200
 
     with running(settings, clock) as service:
@@ -238,7 +240,7 @@ def test_a_late_answer_of_the_ledger_is_one(settings: Settings, clock: FakeClock
         async with serving(create_app(settings, running=service)) as (http, _):
             with hanging() as answers:
                 check = asyncio.create_task(http.get("/health/ready"))
-                await until(lambda: probing_threads() == 1)
+                await until(lambda: len(probing_threads()) == 1)
                 assert not check.done()
                 answers.set()
                 return await check

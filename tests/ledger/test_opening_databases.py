@@ -97,6 +97,7 @@ def test_a_database_that_cannot_be_reached_is_refused_in_one_line_that_shows_no_
     [
         ("mysql://user:secret@host/airmatrix", "ledgers on mysql are not supported; give a file path, a sqlite"),
         ("postgresql://user:secret@host", r"the ledger's URL postgresql://user:\*\*\*@host names no database"),
+        ("postgresql://user@host?password=secret", "names no database; add /NAME to it"),
         ("postgresql://user:secret@host:port/airmatrix", "the ledger's postgresql:// URL cannot be read; give a file"),
     ],
 )

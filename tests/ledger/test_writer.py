@@ -23,7 +23,7 @@ from app.errors import (
     QueueFull,
     UnknownFlightIntent,
 )
-from app.flight_intents import FlightIntent, Reservations, State
+from app.flight_intents import FlightIntent, Reservations, State, Submission
 from tests.ledger.district import DEPARTURE_MS, SQUARE, START_MS, STREET
 from tests.ledger.locations import database, on_postgresql, on_sqlite, write_lock
 from tests.ledger.process import (
@@ -301,12 +301,22 @@ def test_after_a_commit_that_failed_the_service_goes_on_as_if_it_had_not_been_tr
     assert_sound(square)
 
 
+def at_once(process: Process, *submissions: Submission) -> list[Outcome | BaseException]:
+    """Submit together, in one batch or several; return outcomes and errors."""
+
+    async def gather() -> list[Outcome | BaseException]:
+        requests = (process.deconfliction.submit(submission) for submission in submissions)
+        return await asyncio.gather(*requests, return_exceptions=True)
+
+    return asyncio.run(gather())
+
+
 def test_while_the_ledger_fails_nobody_waits_for_it(square: Process) -> None:
     with on_commit(fail):
         with pytest.raises(LedgerUnavailable):
             square.submit(SQUARE.submission("N", "S"))
         asyncio.run(until(lambda: square.deconfliction.trouble is not None))
-        failed = outcomes(square, *[SQUARE.submission("N", "S") for _ in range(100)])
+        failed = at_once(square, *[SQUARE.submission("N", "S") for _ in range(100)])
     assert [type(answer) for answer in failed] == [LedgerUnavailable] * 100
     assert "the commit failed: the connection was lost; nothing was recorded" in str(failed[-1])
     assert len(square.ledger.everything()[0]) == 0
@@ -682,9 +692,17 @@ def test_two_operators_may_use_the_same_key(square: Process) -> None:
 def test_a_key_is_kept_for_exactly_its_time(square: Process, clock: FakeClock) -> None:
     submit(square, window_ms=THREE_DAYS_MS)
     clock.advance(ms=POLICY.idempotency_ms)
+    square.submit(SQUARE.submission("N", "S", window_ms=THREE_DAYS_MS))
     assert submit(square, window_ms=THREE_DAYS_MS).replayed == b"1"
     clock.advance(ms=1)
-    assert submit(square, window_ms=THREE_DAYS_MS).intent.sequence == 2
+    square.submit(SQUARE.submission("N", "S", window_ms=THREE_DAYS_MS))
+    assert submit(square, window_ms=THREE_DAYS_MS).intent.sequence == 4
+
+
+def test_a_key_outlives_a_clock_that_is_wrong_for_a_while(square: Process, clock: FakeClock) -> None:
+    submit(square, window_ms=THREE_DAYS_MS)
+    clock.advance(ms=2 * DAY_MS)
+    assert submit(square, window_ms=THREE_DAYS_MS).replayed == b"1"
 
 
 def test_a_key_of_a_request_that_was_not_recorded_can_be_used_again(square: Process, clock: FakeClock) -> None:
