@@ -112,7 +112,7 @@ class Policy:
 class BatchReport:
     """What became of a batch, for logs and metrics. Seconds; `answers` has an exception for a request that failed.
 
-    For each request, `queue_s` from its arrival until it was planned, `plan_s` for planning. `write_s` for
+    For each request that was planned, `queue_s` from its arrival until then, `plan_s` for planning. `write_s` for
     writing the rows of all, `commit_s` for the commit; `index_size` in reservations.
     """
 
@@ -358,12 +358,14 @@ class Deconfliction:
                 request.future.set_exception(answer)
             else:
                 request.future.set_result(answer)
+        # What was never planned has no times.
+        begun = [request for request in taken if request.planned]
         report = BatchReport(
             requests=taken,
             answers=answers,
             failure=failure,
-            queue_s=[max(request.begun - request.arrived, 0.0) for request in taken],
-            plan_s=[request.planned - request.begun for request in taken],
+            queue_s=[request.begun - request.arrived for request in begun],
+            plan_s=[request.planned - request.begun for request in begun],
             write_s=0.0 if transaction is None else transaction.write_s,
             commit_s=0.0 if transaction is None else transaction.commit_s,
             index_size=len(self._planner.index),
@@ -371,8 +373,11 @@ class Deconfliction:
         # A log that cannot be written (its disk is full, its reader gone) must not stop the writer.
         with suppress(OSError, ValueError):
             _log_batch(report)
-        with suppress(OSError, ValueError):
+        try:
             self._observe(report)
+        except Exception as error:
+            with suppress(OSError, ValueError):
+                log.error("batch could not be observed", exc_info=error)
 
     def _see_to_trouble(self, taken: list[Request]) -> None:
         """If the ledger failed, ask it again; in vain: take all that wait, and raise `LedgerUnavailable`."""

@@ -1,5 +1,7 @@
 """`airmatrix db`: look after the ledger."""
 
+import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +35,11 @@ def backup(
     `createdb` and `pg_restore` bring it back.
     """
     settings = Settings.given(ledger=ledger)
-    with progress_bar("copying", 1.0) as advance_to:
-        size = back_up(settings.ledger, out, replace=force, advance=advance_to)
+    # So that nothing half done is left behind.
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        with progress_bar("copying", 1.0) as advance_to:
+            size = back_up(settings.ledger, out, replace=force, advance=advance_to)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     typer.echo(f"{out} is a copy of {parse_location(settings.ledger)}: {size:,} bytes")

@@ -73,7 +73,9 @@ def serve(
 def _supervise(basis: Basis, listener: socket.socket, announce: Callable[[], None]) -> None:
     """Run workers until a signal comes."""
     workers = Workers(basis.settings.workers, partial(_worker, basis.settings, basis.fingerprint, listener))
-    with TemporaryDirectory(prefix="airmatrix-metrics-") as folder:
+    # In memory, where there is such a place: a full disk must not end a worker that counts something.
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
+    with TemporaryDirectory(prefix="airmatrix-metrics-", dir=memory) as folder:
         # Where the workers add up their metrics.
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
         received = workers.run(on_ready=announce, on_death=forget_process, on_stop=listener.close)

@@ -6,6 +6,7 @@ import socket
 import sqlite3
 import subprocess
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -23,10 +24,10 @@ from tests.cli.serving import AIRMATRIX, Server, environment, serving, started
 EVERYWHERE = "0.0.0.0"  # noqa: S104
 
 
-def serve(folder: Path, *options: object, **variables: str) -> Outcome:
+def serve(folder: Path, *options: object, program: Sequence[str | Path] = (AIRMATRIX,), **variables: str) -> Outcome:
     """Run a service that is expected to refuse to start, in a process of its own."""
     done = subprocess.run(
-        [AIRMATRIX, "serve", *map(str, options)],
+        [*program, "serve", *map(str, options)],
         cwd=folder, env=environment(**variables), capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     refusal = [line for line in done.stderr.splitlines() if " [info " not in line]
