@@ -33,7 +33,7 @@ _FORGETFUL = {"fsync": "off", "full_page_writes": "off"}
 # Waits until its standard input ends, however we ended, then leaves nothing of the server behind.
 _GUARDIAN = 'read -r _; "$0" stop --silent --mode=immediate --pgdata="$1/data"; rm -rf "$1"'
 
-Mode = Literal["smart", "fast", "immediate"]
+Mode = Literal["fast", "immediate"]
 
 
 class NoPostgres(Exception):

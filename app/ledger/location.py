@@ -51,6 +51,7 @@ def parse_location(text: str) -> Location:
         url = make_url(text)
     except (ArgumentError, ValueError) as error:
         raise StartupError(f"the ledger's {scheme}:// URL cannot be read; {_FORMS}") from error
+    location = Location(url.set(drivername="postgresql+psycopg"))
     if not url.database:
-        raise StartupError(f"the ledger's URL {url.render_as_string()} names no database; add /NAME to it")
-    return Location(url.set(drivername="postgresql+psycopg"))
+        raise StartupError(f"the ledger's URL {location} names no database; add /NAME to it")
+    return location

@@ -22,6 +22,7 @@ from planner.airmatrix import AirMatrix
 from tests.api.bodies import SUBMIT, intent, problem
 from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, OLD_TOWN, START_MS, STREET
+from tests.ledger.locations import on_sqlite
 from tests.ledger.process import FakeClock
 
 STATUS = "/v1/airspace/status"
@@ -59,6 +60,7 @@ def corner(grid: AirMatrix, i: float, j: float) -> tuple[float, float]:
 # What it is
 
 
+@on_sqlite
 def test_the_airspace_says_exactly_what_it_is(client: Client) -> None:
     answer = client.get("/v1/airspace").json()
     grid = OLD_TOWN.airspace.grid
@@ -90,6 +92,7 @@ def test_the_airspace_says_exactly_what_it_is(client: Client) -> None:
     AirspaceAnswer.model_validate(answer)
 
 
+@on_sqlite
 def test_buildings_are_geojson_with_heights(client: Client) -> None:
     response = client.get("/v1/airspace/buildings")
     answer = response.json()
@@ -105,6 +108,7 @@ def test_buildings_are_geojson_with_heights(client: Client) -> None:
     FeatureCollection.model_validate(answer)
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     ("parameters", "expected"),
     [
@@ -121,6 +125,7 @@ def test_static_blocks_are_those_with_buildings(
     StaticAnswer.model_validate(answer)
 
 
+@on_sqlite
 @pytest.mark.parametrize("path", ["/v1/airspace/static", STATUS, OCCUPANCY])
 @pytest.mark.parametrize("layer", ["2", "-1", "top", "1" + "0" * 30])
 def test_a_layer_that_does_not_exist_is_refused(client: Client, path: str, layer: str) -> None:
@@ -128,6 +133,7 @@ def test_a_layer_that_does_not_exist_is_refused(client: Client, path: str, layer
     assert answer["errors"][0]["loc"] == ["query", "layer"]
 
 
+@on_sqlite
 def test_aircraft_types_are_the_paper_s(client: Client) -> None:
     answer = client.get("/v1/aircraft-types").json()
     assert set(answer) == {"items", "next_cursor"}
@@ -137,6 +143,7 @@ def test_aircraft_types_are_the_paper_s(client: Client) -> None:
     AircraftTypeList.model_validate(answer)
 
 
+@on_sqlite
 def test_an_aircraft_type_has_its_speeds_at_full_power_and_as_planned(client: Client) -> None:
     items = client.get("/v1/aircraft-types").json()["items"]
     (phantom,) = [item for item in items if item["id"] == AIRCRAFT]
@@ -234,6 +241,7 @@ def test_status_of_one_colour_has_no_other(flown: Client, status: str, count: in
     assert len(blocks(flown.get(STATUS, **at(DEPARTURE_MS, status=status)))) == count
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     ("west", "east", "columns"),
     [(-1.0, 9.0, [0, 1, 2]), (0.4, 0.6, [0]), (0.5, 1.5, [0, 1]), (1.5, 2.5, [1, 2]), (3.5, 8.0, []), (-2.0, -1.0, [])],
@@ -249,6 +257,7 @@ def test_status_within_a_box_has_the_blocks_that_meet_it(
     assert answer.json()["counts"]["green"] == len(columns)
 
 
+@on_sqlite
 @pytest.mark.parametrize(("south", "north"), [(1.5, 2.0), (-2.0, -0.5)])
 def test_status_within_a_box_north_or_south_of_the_street_is_empty(flown: Client, south: float, north: float) -> None:
     grid = STREET.airspace.grid
@@ -256,6 +265,7 @@ def test_status_within_a_box_north_or_south_of_the_street_is_empty(flown: Client
     assert blocks(flown.get(STATUS, **at(DEPARTURE_MS, bbox=",".join(map(str, box))))) == []
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     "bbox", ["", "1,2,3", "1,2,3,4,5", "a,b,c,d", "72,51,71,52", "71,52,72,51", "nan,51,72,52", "71,51,72,nan"]
 )
@@ -264,6 +274,7 @@ def test_a_box_that_is_none_is_refused(flown: Client, bbox: str) -> None:
     assert [error["loc"] for error in answer["errors"]] == [["query", "bbox"]]
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     ("parameter", "value"),
     [
@@ -313,6 +324,7 @@ def test_status_as_geojson_has_footprints_and_heights(client: Client) -> None:
     assert np.array(upper["geometry"]["coordinates"]) == pytest.approx(np.array([ring]), rel=0, abs=1e-9)
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     ("parameters", "accept", "media_type"),
     [
@@ -364,6 +376,7 @@ def test_a_block_has_the_status_of_now_whatever_the_span_asked_for(flown: Client
     assert (answer["status"], answer["schedule"]) == ("green", [])
 
 
+@on_sqlite
 def test_a_block_with_a_building_says_so(client: Client) -> None:
     assert client.get("/v1/airspace/blocks/3/2/0").json()["statically_occupied"] is True
     assert client.get("/v1/airspace/blocks/3/2/1").json()["statically_occupied"] is False
@@ -399,17 +412,20 @@ def test_a_schedule_is_in_the_order_of_time(flown: Client) -> None:
     assert enters == sorted(enters)
 
 
+@on_sqlite
 @pytest.mark.parametrize("block", ["8/0/0", "0/5/0", "0/0/2", "0/0/" + "9" * 40])
 def test_a_block_outside_the_airspace_is_unknown(client: Client, block: str) -> None:
     problem(client.get(f"/v1/airspace/blocks/{block}"), 404, "unknown-block")
 
 
+@on_sqlite
 @pytest.mark.parametrize("block", ["-1/0/0", "a/0/0", "0.5/0/0"])
 def test_a_block_s_indices_are_whole_numbers_from_zero(client: Client, block: str) -> None:
     answer = problem(client.get(f"/v1/airspace/blocks/{block}"), 422, "validation-error")
     assert answer["errors"][0]["loc"] == ["path", "i"]
 
 
+@on_sqlite
 @pytest.mark.parametrize("path", ["/v1/airspace/blocks/0/0/0", OCCUPANCY])
 @pytest.mark.parametrize("to", ["2026-11-22T08:00:00Z", "2026-11-22T07:59:59.999Z"])
 def test_a_span_must_last(client: Client, path: str, to: str) -> None:

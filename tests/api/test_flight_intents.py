@@ -13,6 +13,7 @@ from planner.airspace import OccupancyRule
 from tests.api.bodies import FLIGHT_INTENT, PLANNED, PREVIEW, PREVIEWED, PROBLEM, SUBMIT, intent, problem
 from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import DEPARTURE_MS, OLD_TOWN, START_MS, STREET, district
+from tests.ledger.locations import on_sqlite
 from tests.ledger.process import DAY_MS, FakeClock
 
 HORIZON_MS = 30 * DAY_MS
@@ -118,6 +119,7 @@ def test_reservations_are_sorted_by_enter_then_by_block(client: Client) -> None:
     assert held == sorted(held, key=lambda hold: (hold["enter"], hold["block"]))
 
 
+@on_sqlite
 def test_waypoints_are_block_centres_with_nine_decimals(client: Client) -> None:
     answer = client.post(SUBMIT, json=intent()).json()
     for point in answer["trajectory"]:
@@ -274,15 +276,18 @@ def test_the_last_millisecond_of_the_horizon_is_planned(client: Client) -> None:
     assert client.post(SUBMIT, json=intent(earliest_ms=START_MS + HORIZON_MS, window_ms=0)).status_code == 201
 
 
+@on_sqlite
 def test_a_millisecond_beyond_the_horizon_is_refused(client: Client) -> None:
     response = client.post(SUBMIT, json=intent(earliest_ms=START_MS + HORIZON_MS + 1, window_ms=0))
     assert "2026-12-22T08:00:00.000Z" in problem(response, 422, "beyond-horizon")["detail"]
 
 
+@on_sqlite
 def test_a_window_that_ends_beyond_the_horizon_is_refused(client: Client) -> None:
     problem(client.post(SUBMIT, json=intent(window_ms=HORIZON_MS)), 422, "beyond-horizon")
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     ("time", "slug"),
     [("9999-12-31T23:59:59.999Z", "beyond-horizon"), ("1970-01-01T00:00:00Z", "departure-in-the-past")],
@@ -291,6 +296,7 @@ def test_absurd_times_are_refused_by_what_is_wrong_with_them(client: Client, tim
     problem(client.post(SUBMIT, json=intent(earliest_departure=time)), 422, slug)
 
 
+@on_sqlite
 @pytest.mark.parametrize("path", [SUBMIT, PREVIEW])
 def test_a_preview_is_refused_as_a_submission_is(client: Client, path: str) -> None:
     problem(client.post(path, json=intent(earliest_ms=START_MS - 2, window_ms=1)), 422, "departure-in-the-past")
@@ -438,6 +444,7 @@ def test_filters_hold_on_the_next_page_too(listed: Client) -> None:
     assert [item["sequence"] for item in second["items"]] == [5]
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     "cursor", ["", "garbage", "5", "YWZ0ZXI6", "YWZ0ZXI6LTE", "YWZ0ZXI6MS41", "YmVmb3JlOjE", "ä", "%00", "A" * 5000]
 )
@@ -445,6 +452,7 @@ def test_a_cursor_of_somebody_elses_making_is_refused(listed: Client, cursor: st
     problem(listed.get(SUBMIT, params={"cursor": cursor}), 422, "invalid-cursor")
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     "parameters",
     [

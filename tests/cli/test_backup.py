@@ -1,6 +1,5 @@
 """`airmatrix db backup`: a whole ledger as of one moment, into a file that appears whole or not at all."""
 
-import os
 import shutil
 import signal
 import sqlite3
@@ -9,6 +8,7 @@ import threading
 import time
 from contextlib import closing
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -19,7 +19,7 @@ from tests.cli.conftest import History, Run
 from tests.cli.serving import AIRMATRIX, environment, serving
 from tests.cli.test_serve import contents, foreign_database, names
 from tests.cli.town import along_row
-from tests.ledger.locations import database, migrated_file
+from tests.ledger.locations import PostgresqlLedgers, database, migrated_file, on_postgresql
 from tests.ledger.process import assert_gapless, assert_no_overlaps
 
 
@@ -185,10 +185,101 @@ def test_an_interrupted_backup_leaves_nothing(tmp_path: Path, number: signal.Sig
 # PostgreSQL
 
 
-@pytest.fixture
-def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder in which all programs are looked for."""
-    folder = tmp_path / "programs"
-    folder.mkdir()
-    monkeypatch.setenv("PATH", str(folder))
-    return folder
+DUMP = """#!/bin/sh
+echo "$@" > {folder}/arguments
+echo "$PGPASSWORD" > {folder}/password
+for argument in "$@"; do case $argument in --file=*) echo dump > "${{argument#--file=}}";; esac; done
+"""
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str | None) -> None:
+    """Let there be no other programs than a `pg_dump` of this script."""
+    programs = folder / "programs"
+    programs.mkdir()
+    if script is not None:
+        (programs / "pg_dump").write_text(script)
+        (programs / "pg_dump").chmod(0o755)
+    monkeypatch.setenv("PATH", str(programs))
+
+
+@on_postgresql
+def test_a_backup_of_a_database_is_restored_by_pg_restore(
+    airmatrix: Run, tmp_path: Path, town_file: Path, ledgers: PostgresqlLedgers
+) -> None:
+    location, restored = ledgers.migrated(), ledgers.vacant()
+    options = ("--airspace", str(town_file))
+    with serving(tmp_path, *options, "--ledger", location) as server, Client(server.url) as client:
+        flights = [client.submit(along_row(row, 1, now_ms() + 600_000)) for row in range(4)]
+        outcome = airmatrix("db", "backup", "--ledger", location, "--out", "ledger.dump")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert names(tmp_path) == ["ledger.dump", "serve.log"]
+    pg_restore = shutil.which("pg_restore")
+    assert pg_restore is not None
+    subprocess.run([pg_restore, f"--dbname={restored}", "--exit-on-error", "ledger.dump"], check=True)
+    with serving(tmp_path, *options, "--ledger", restored) as server, Client(server.url) as client:
+        assert list(client.flight_intents()) == flights
+        again = along_row(0, 1, now_ms() + 600_000)
+        assert client.submit(again).sequence == 5
+    assert_no_overlaps(restored)
+    assert airmatrix("verify", "--ledger", restored, "--airspace", town_file).status == 0
+
+
+@on_postgresql
+def test_the_password_is_passed_on_but_not_shown(
+    airmatrix: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ledgers: PostgresqlLedgers
+) -> None:
+    location = ledgers.migrated()
+    password = urlsplit(location).password
+    assert password
+    pretend(monkeypatch, tmp_path, DUMP.format(folder=tmp_path))
+    outcome = airmatrix("db", "backup", "--ledger", location, "--out", "ledger.dump")
+    assert outcome.status == 0
+    assert (tmp_path / "password").read_text() == f"{password}\n"
+    shown = (tmp_path / "arguments").read_text() + outcome.out + outcome.err
+    assert urlsplit(location).path.removeprefix("/") in shown
+    assert password not in shown
+
+
+@on_postgresql
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (None, ("pg_dump", "install PostgreSQL's client programs")),
+        (
+            "#!/bin/sh\necho 'pg_dump: error: server\nversion mismatch' >&2\nexit 1\n",
+            ("error: server version mismatch",),
+        ),
+    ],
+    ids=["no pg_dump", "pg_dump fails"],
+)
+def test_a_database_that_cannot_be_dumped_is_reported_in_one_line(
+    airmatrix: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    ledgers: PostgresqlLedgers,
+    script: str | None,
+    words: tuple[str, ...],
+) -> None:
+    location = ledgers.migrated()
+    pretend(monkeypatch, tmp_path, script)
+    airmatrix("db", "backup", "--ledger", location, "--out", "ledger.dump").assert_refused(*words)
+    assert names(tmp_path) == ["programs"]
+
+
+@on_postgresql
+def test_a_database_is_upgraded_without_showing_its_password(airmatrix: Run, ledgers: PostgresqlLedgers) -> None:
+    location = ledgers.migrated()
+    password = urlsplit(location).password
+    outcome = airmatrix("db", "upgrade", "--ledger", location)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert outcome.out == f"{location.replace(str(password), '***')} has schema 0002\n"
+
+
+@on_postgresql
+def test_a_database_without_ledger_is_neither_backed_up_nor_upgraded(
+    airmatrix: Run, tmp_path: Path, ledgers: PostgresqlLedgers
+) -> None:
+    location = ledgers.vacant()
+    airmatrix("db", "backup", "--ledger", location, "--out", "ledger.dump").assert_refused("there is no ledger at")
+    airmatrix("db", "upgrade", "--ledger", location).assert_refused("there is no ledger at")
+    assert names(tmp_path) == []

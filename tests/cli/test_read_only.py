@@ -3,8 +3,9 @@
 import os
 import shutil
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import httpx
@@ -15,9 +16,11 @@ from app.flight_intents import State
 from app.times import now_ms
 from tests.cli.conftest import History
 from tests.cli.serving import AIRMATRIX, Server, serving
+from tests.cli.standby import on_port, standby
 from tests.cli.test_serve import foreign_database, serve
 from tests.cli.town import along_row
-from tests.ledger.locations import content, database, migrated_file
+from tests.ledger.locations import Ledgers, content, database, migrated_file
+from tests.postgres import Cluster, NoPostgres, cluster
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +124,8 @@ def test_what_is_no_ledger_of_this_airspace_and_schema_is_refused_and_left_as_it
     assert content(tmp_path / "kept" / "ledger.sqlite") == before
 
 
-def test_what_others_write_is_read_at_once(tmp_path: Path, town_file: Path) -> None:
-    options = ("--airspace", str(town_file))
+def test_what_others_write_is_read_at_once(ledgers: Ledgers, tmp_path: Path, town_file: Path) -> None:
+    options = ("--airspace", str(town_file), "--ledger", ledgers.vacant())
     with (
         serving(tmp_path, *options) as writing,
         serving(tmp_path, *options, "--read-only", "--workers", "2", log="reading.log") as reading,
@@ -138,6 +141,45 @@ def test_what_others_write_is_read_at_once(tmp_path: Path, town_file: Path) -> N
                 assert reader.flight_intent(intent.id) == cancelled
                 assert reader.events(2 * number).items == writer.events(2 * number).items
                 assert reader.readiness().revision == 2 * number + 2
+
+
+@pytest.fixture
+def primary() -> Iterator[Cluster]:
+    """Return a PostgreSQL server that may have a standby."""
+    with ExitStack() as stack:
+        try:
+            private = stack.enter_context(cluster())
+        except NoPostgres as error:
+            if os.environ.get("CI") == "true":
+                raise
+            pytest.skip(str(error))
+        yield private
+
+
+@pytest.mark.postgres
+def test_a_hot_standby_is_read_and_cannot_be_served_otherwise(
+    primary: Cluster, tmp_path: Path, town_file: Path
+) -> None:
+    location, options = primary.database(), ("--airspace", str(town_file))
+    with (
+        serving(tmp_path, *options, "--ledger", location, log="writing.log") as writing,
+        Client(writing.url) as writer,
+        standby(primary) as port,
+    ):
+        copy = on_port(location, port)
+        serve(tmp_path, *options, "--port", 0, "--ledger", copy).assert_refused("read-only transaction")
+        with (
+            serving(tmp_path, *options, "--ledger", copy, "--read-only") as reading,
+            Client(reading.url) as reader,
+        ):
+            flights = [writer.submit(along_row(row, 1, now_ms() + 600_000)) for row in range(4)]
+            # It follows, a moment behind.
+            until = time.monotonic() + 30
+            while reader.readiness().revision < 4 and time.monotonic() < until:
+                time.sleep(0.01)
+            assert list(reader.flight_intents()) == flights
+            with pytest.raises(ProblemAnswer, match="only answers reads"):
+                reader.cancel(flights[0].id)
 
 
 # Without permission to write

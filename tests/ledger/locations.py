@@ -68,23 +68,23 @@ class PostgresqlLedgers:
     """Databases of a server, copied from one at the newest schema; all are dropped by `close`."""
 
     def __init__(self, server: Server, template: str) -> None:
-        self.server = server
+        self._server = server
         self._template = template
         self._made: list[str] = []
 
     def vacant(self) -> str:
-        return self._kept(self.server.database())
+        return self._kept(self._server.database())
 
     def migrated(self) -> str:
         return self.copy(self._template)
 
     def copy(self, location: str) -> str:
-        return self._kept(self.server.database(location))
+        return self._kept(self._server.database(location))
 
     def close(self) -> None:
         """Drop them."""
         while self._made:
-            self.server.drop(self._made.pop())
+            self._server.drop(self._made.pop())
 
     def _kept(self, location: str) -> str:
         self._made.append(location)

@@ -60,7 +60,11 @@ def described(intent: FlightIntent) -> object:
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("search", Search)
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    ("ledgers", "seed"),
+    [*(("sqlite", seed) for seed in range(6)), pytest.param("postgresql", 0, marks=pytest.mark.postgres)],
+    indirect=["ledgers"],
+)
 def test_a_restarted_process_plans_what_one_that_kept_running_plans(
     seed: int, search: Search, ledgers: Ledgers, clock: FakeClock
 ) -> None:
