@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
@@ -71,6 +72,8 @@ class Workers:
         `on_stop` before they are stopped. Raises `StartupError` if one dies before all are ready.
         """
         self._due = [time.monotonic()] * self._count
+        # Left to the first start, this would unblock what is blocked around it.
+        resource_tracker.ensure_running()
         with _caught(signal.SIGTERM, signal.SIGINT) as caught:
             try:
                 while True:
@@ -91,16 +94,13 @@ class Workers:
         now = time.monotonic()
         starting, self._due = [due for due in self._due if due <= now], [due for due in self._due if due > now]
         for _ in starting:
-            pulse, other_end = _spawning.Pipe(duplex=False)
-            process = _spawning.Process(target=_run, args=(self._work, other_end))
-            # Interrupting from a terminal reaches every process, but it is for the parent to stop its workers.
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
-                process.start()
-            finally:
-                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-            other_end.close()
-            self._workers.append(_Worker(process, pulse, heard=now))
+                self._workers.append(_start(self._work))
+            except OSError as error:
+                if not self._announced:
+                    raise StartupError(f"cannot start a worker: {error.strerror}") from error
+                _tell(log.critical, "no worker could be started", error=error.strerror)
+                self._due.append(now + _AGAIN_S)
 
     def _listen(self, caught: int) -> None:
         """Wait until a worker says something or dies, or a signal comes, or some time has passed."""
@@ -114,7 +114,7 @@ class Workers:
 
     def _hear(self, worker: _Worker, *, ready: bool) -> None:
         if ready and not worker.ready:
-            log.info("worker is ready", worker=worker.process.pid)
+            _tell(log.info, "worker is ready", worker=worker.process.pid)
         worker.ready = ready
         worker.heard, worker.may_be_silent_s = time.monotonic(), self._silence_s
 
@@ -122,7 +122,12 @@ class Workers:
         for worker in self._workers:
             silent_s = time.monotonic() - worker.heard
             if silent_s > worker.may_be_silent_s:
-                log.critical("worker is silent and is killed", worker=worker.process.pid, silent_s=round(silent_s, 1))
+                _tell(
+                    log.critical,
+                    "worker is silent and is killed",
+                    worker=worker.process.pid,
+                    silent_s=round(silent_s, 1),
+                )
                 worker.process.kill()
                 worker.process.join()
 
@@ -132,7 +137,7 @@ class Workers:
             assert pid is not None
             if not self._announced:
                 raise StartupError(f"worker {pid} could not start; it ended with status {status}, its reason is above")
-            log.critical("worker died, another one is started", worker=pid, status=status)
+            _tell(log.critical, "worker died, another one is started", worker=pid, status=status)
             self._workers.remove(worker)
             worker.pulse.close()
             on_death(pid)
@@ -145,11 +150,31 @@ class Workers:
         for worker in self._workers:
             worker.process.join(max(until - time.monotonic(), 0.0))
             if worker.process.exitcode is None:
-                log.critical("worker does not stop and is killed", worker=worker.process.pid)
+                _tell(log.critical, "worker does not stop and is killed", worker=worker.process.pid)
                 worker.process.kill()
                 worker.process.join()
             worker.pulse.close()
         self._workers.clear()
+
+
+def _start(work: Work) -> _Worker:
+    """Start a process; raises `OSError` where the system has no room for one more."""
+    pulse, other_end = _spawning.Pipe(duplex=False)
+    with closing(other_end):
+        process = _spawning.Process(target=_run, args=(work, other_end))
+        # Interrupting from a terminal reaches every process, but it is for the parent to stop its workers.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    return _Worker(process, pulse, heard=time.monotonic())
+
+
+def _tell(say: Callable[..., object], event: str, **details: object) -> None:
+    """Log an event; a log that cannot be written (its disk is full, its reader gone) stops nobody."""
+    with suppress(OSError, ValueError):
+        say(event, **details)
 
 
 @contextmanager
@@ -200,8 +225,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
-    with suppress(OSError, ValueError):
-        log.critical("the parent process is gone, so this worker ends")
+    _tell(log.critical, "the parent process is gone, so this worker ends")
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_STOP_S)
     os._exit(1)

@@ -1,5 +1,6 @@
 """A ledger in a SQLite file."""
 
+import os
 import sqlite3
 import time
 from contextlib import closing
@@ -46,6 +47,8 @@ class SqliteDatabase:
         path = self._path
         if not path.parent.is_dir():
             raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise StartupError(f"cannot write ledger {path}: no permission; --read-only serves it to readers")
         if not path.exists() or path.stat().st_size == 0 or _check_is_ledger(path)[_WRITE_VERSION] != _WAL:
             _mark(path)
 
