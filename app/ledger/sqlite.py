@@ -22,10 +22,11 @@ _WAIT_S = 10.0
 _POLL_S = 0.001
 # As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
 _READERS = 40
-# A flight's reservations lie all over the table, so its pages had better stay in memory (KiB), and be copied from the
-# log to the file only now and then (pages).
+# A flight's reservations lie all over the table, each on a page of its own. So pages are small (bytes; new ledgers
+# only), stay in memory (KiB), and are copied from the log to the file only now and then (pages).
+_PAGE_BYTES = 2048
 _WRITER_CACHE_KIB = 64 * 1024
-_CHECKPOINT_PAGES = 10_000
+_CHECKPOINT_PAGES = 20_000
 
 
 class SqliteDatabase:
@@ -122,6 +123,7 @@ def _mark(path: Path) -> None:
     while True:
         try:
             with closing(sqlite3.connect(path, timeout=_WAIT_S, isolation_level=None)) as connection:
+                connection.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute("PRAGMA journal_mode = WAL")
                 return
