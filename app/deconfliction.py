@@ -31,7 +31,7 @@ from app.errors import (
 )
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
 from app.ledger.ledger import CommitUncertain, ConstraintViolated, Ledger, Transaction
-from app.times import format_time
+from app.times import format_time, monotonic_ms
 from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import NoPlan, PlannerError
 from planner.path import Plan, Trajectory
@@ -48,15 +48,15 @@ _OPEN_FOR_MS = 86_400_000
 _CATCH_UP_ENTRIES = 1_000
 # Clocks are corrected by less than this all the time, and set back by more only if they were wrong.
 _STEP_BACK_MS = 10_000
-# How long the ledger is asked, and how often, what became of a commit.
-_LOOK_UP_S, _RETRY_S = 10.0, 0.1
+# How often the ledger is asked what became of a commit.
+_RETRY_S = 0.1
 # A ledger that failed counts as well again after a batch, or if it can be written for so long without one that fails.
 _CALM_S = 2.0
 # Without requests the writer wakes up this often; while there is something to remove, this often.
 _IDLE_S, _PAUSE_S = 1.0, 0.01
 # How often retention looks for what has passed; and how much it removes at once, so that nobody waits long for it.
 _HOUSE_MS = 60_000
-_REMOVE_INTENTS, _REMOVE_ENTRIES = 32, 256
+_REMOVE_INTENTS, _REMOVE_ENTRIES, _REMOVE_ANSWERS = 32, 256, 64
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,14 @@ class PreviewPlan:
 
 @dataclass(frozen=True)
 class Policy:
-    """How far ahead flights may depart, how long answers to idempotency keys are kept, and flights once they have
-    ended (None: for ever), in ms; how many requests may wait."""
+    """How far ahead flights may depart; how long answers to idempotency keys are kept, and flights once they have
+    ended (None: for ever); how long the ledger is asked what became of a commit: in ms. How many requests may wait."""
 
     horizon_ms: int
     idempotency_ms: int
     queue_limit: int
     retention_ms: int | None = None
+    look_up_ms: int = 10_000
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,7 @@ class _Redo(Exception):
 class Deconfliction:
     """The only writer of a process. `start` it before submitting, `stop` it to finish what waits.
 
+    `clock` says what time it is, and may be wrong; `elapsed_ms` how much has passed, and never jumps.
     `observe` is told of every batch after it was answered; `on_death` is called if the writer thread ends by itself.
     """
 
@@ -160,6 +162,7 @@ class Deconfliction:
         clock: Callable[[], int],
         policy: Policy,
         *,
+        elapsed_ms: Callable[[], int] = monotonic_ms,
         observe: Callable[[BatchReport], None] = lambda _: None,
         on_death: Callable[[], None] = lambda: None,
     ) -> None:
@@ -167,6 +170,7 @@ class Deconfliction:
         self._planner = planner
         self._performances = performances
         self._clock = clock
+        self._elapsed_ms = elapsed_ms
         self._policy = policy
         self._observe = observe
         self._on_death = on_death
@@ -175,6 +179,7 @@ class Deconfliction:
         self._revision: int | None = None
         self._watermark_ms = 0
         self._forgotten_ms = 0
+        self._known_ms = 0
         self._kept_house_ms = 0
         self._pause_s = _IDLE_S
         self._failed = 0.0
@@ -186,8 +191,12 @@ class Deconfliction:
     def start(self) -> None:
         """Load the index and begin to take requests; raises `LedgerUnavailable`."""
         with self._ledger.transaction() as transaction:
-            self._catch_up(transaction, self._now(), revision=None)
+            now = self._now()
+            self._catch_up(transaction, now, revision=None)
+            newest_ms = transaction.newest_change()
         self._revision = transaction.revision
+        self._kept_house_ms = now
+        self._known_ms = (now if newest_ms is None else min(now, newest_ms)) - self._elapsed_ms()
         self._thread.start()
 
     def stop(self) -> None:
@@ -301,6 +310,13 @@ class Deconfliction:
         self._watermark_ms = max(self._watermark_ms, clock_ms)
         return self._watermark_ms
 
+    def _surely(self, now: int) -> int:
+        """Return a time that has passed for sure, even if the clock is ahead: what is old by it may be removed.
+
+        That is `now`, or what the ledger knew when this process started and the time since then, if that is less.
+        """
+        return min(now, self._known_ms + self._elapsed_ms())
+
     def _work(self) -> None:
         try:
             self._serve()
@@ -325,13 +341,13 @@ class Deconfliction:
             try:
                 first = self._queue.get(timeout=self._pause_s)
             except queue.Empty:
-                self._keep_house()
+                self._keep_house(idle=True)
                 continue
             if first is None:
                 self._stopping = True
             elif first.future.set_running_or_notify_cancel():
                 self._answer([first])
-                self._keep_house()
+                self._keep_house(idle=False)
 
     def _answer(self, taken: list[Request]) -> None:
         """Write the request in `taken` and those that wait behind it, and answer them."""
@@ -349,10 +365,14 @@ class Deconfliction:
         except Exception as error:
             failure = error
             self._fail(error)
-            known = isinstance(error, LedgerUnavailable)
-            answers = [error if known else LedgerUnavailable("the ledger writer failed; nothing was recorded")] * len(
-                taken
-            )
+            unknown = LedgerUnavailable("the ledger writer failed; nothing was recorded")
+            answers = [error if isinstance(error, LedgerUnavailable) else unknown] * len(taken)
+        except BaseException:
+            for request in taken:
+                request.future.set_exception(
+                    OutcomeUnknown("the ledger writer has died; repeat the request with the same Idempotency-Key")
+                )
+            raise
         for request, answer in zip(taken, answers, strict=True):
             if isinstance(answer, BaseException):
                 request.future.set_exception(answer)
@@ -402,6 +422,7 @@ class Deconfliction:
     def _fail(self, error: Exception) -> None:
         self.trouble = str(error) if isinstance(error, LedgerUnavailable | CommitUncertain) else repr(error)
         self._failed = time.monotonic()
+        self._pause_s = _IDLE_S
 
     def _write(self, taken: list[Request]) -> tuple[list[object], Transaction]:
         """Run the requests in one transaction; return their answers, and the transaction.
@@ -476,7 +497,7 @@ class Deconfliction:
         """Return a request's answer, or the exception that is its answer; its neighbours are not harmed."""
         try:
             with transaction.savepoint():
-                return request.run(transaction, now)
+                return self._run(request, transaction, now)
         except LedgerUnavailable:
             raise
         except Exception as error:
@@ -484,64 +505,80 @@ class Deconfliction:
             self._catch_up(transaction, now, revision=None)
             if isinstance(error, ConstraintViolated):
                 return LedgerUnavailable(f"the ledger refused the rows, nothing was recorded; try again ({error})")
-            return error
+            return error.__cause__ if isinstance(error, _Redo) else error
 
     def _look_up(self, taken: list[Request]) -> list[object]:
         """Return the answers to requests whose commit is uncertain: what the ledger has of them.
 
-        Under the write lock, so that a commit that is still on its way has either happened or never will.
+        After a commit that succeeded: it had the write lock, so the uncertain one has happened before it or never
+        will, and it is durable, so what it saw is.
         """
-        give_up = time.monotonic() + _LOOK_UP_S
+        give_up = time.monotonic() + self._policy.look_up_ms / 1000
         while True:
             try:
-                with self._ledger.locked():
-                    return [
-                        request.look_up() or LedgerUnavailable("the commit failed; nothing was recorded")
-                        for request in taken
-                    ]
+                with self._ledger.transaction() as transaction:
+                    transaction.touch()
+                return [
+                    request.look_up() or LedgerUnavailable("the commit failed; nothing was recorded")
+                    for request in taken
+                ]
             except Exception as error:
                 if time.monotonic() > give_up:
                     unknown = OutcomeUnknown(
-                        f"the commit failed ({error}), so it is not known whether this was recorded; "
+                        f"the commit failed, and then the ledger ({error}): it is not known whether this was recorded; "
                         "read the flight intents, or repeat the request with the same Idempotency-Key"
                     )
                     return [unknown] * len(taken)
             time.sleep(_RETRY_S)
 
-    def _keep_house(self) -> None:
-        """Between batches: see whether the ledger can be written again, and remove a little of what has passed."""
+    def _keep_house(self, *, idle: bool) -> None:
+        """Between batches: see whether the ledger can be written again, keep up with others, remove what has passed."""
         if self.trouble is not None:
             self._probe()
             return
-        now = self._watermark_ms
-        if self._policy.retention_ms is None or abs(now - self._kept_house_ms) < _HOUSE_MS:
-            return
         try:
-            with self._ledger.transaction() as transaction:
-                removed = self._remove_passed(transaction, now, self._policy.retention_ms)
+            if idle:
+                self._keep_up()
+            removed = self._remove_passed()
         except Exception as error:
+            with suppress(OSError, ValueError):
+                log.error("housekeeping failed", error=str(error))
             self._fail(error)
             return
         # As long as there is more to remove, after every batch.
         self._pause_s = _PAUSE_S if removed else _IDLE_S
+
+    def _keep_up(self) -> None:
+        """Bring the index up to the ledger's newest revision, so that it is not far behind when a request comes."""
+        if self._revision is not None and self._ledger.revision() != self._revision:
+            revision, self._revision = self._revision, None
+            with self._ledger.transaction() as transaction:
+                self._catch_up(transaction, self._now(), revision)
+            self._revision = transaction.revision
+
+    def _remove_passed(self) -> int:
+        """Remove a little of what is old enough, and return how much."""
+        now = self._watermark_ms
+        if abs(now - self._kept_house_ms) < _HOUSE_MS:
+            return 0
+        known_ms = self._surely(now)
+        with self._ledger.transaction() as transaction:
+            removed = transaction.remove_answers(known_ms - self._policy.idempotency_ms, _REMOVE_ANSWERS)
+            if self._policy.retention_ms is not None:
+                before_ms = known_ms - self._policy.retention_ms
+                removed += transaction.remove_ended(before_ms, _REMOVE_INTENTS)
+                removed += transaction.remove_journal(before_ms, _REMOVE_ENTRIES)
         if not removed:
             self._kept_house_ms = now
-
-    def _remove_passed(self, transaction: Transaction, now: int, retention_ms: int) -> int:
-        """Remove some of what retention lets go, and return how much."""
-        self._forget_answers(transaction, now)
-        before_ms = transaction.seen(now) - retention_ms
-        removed = transaction.remove_ended(before_ms, _REMOVE_INTENTS)
-        return removed + transaction.remove_journal(before_ms, _REMOVE_ENTRIES)
-
-    def _forget_answers(self, transaction: Transaction, now: int) -> None:
-        transaction.forget_answers(transaction.seen(now) - self._policy.idempotency_ms)
+        return removed
 
     def _catch_up(self, transaction: Transaction, now: int, revision: int | None) -> None:
         """Bring the index from a revision (None: from nothing) to the transaction's; drop what has passed."""
         index = self._planner.index
-        lags = revision is None or transaction.revision - revision > _CATCH_UP_ENTRIES
-        if revision is None or lags or revision < transaction.journal_removed:
+        # After a failover that lost commits, revisions are not what they were.
+        known = revision is not None and revision <= transaction.revision and not transaction.on_new_connection
+        lags = revision is not None and transaction.revision - revision > _CATCH_UP_ENTRIES
+        if revision is None or not known or lags or revision < transaction.journal_removed:
             index.clear()
             held = transaction.held_after(now)
             index.reserve(held.block, held.enter_ms, held.exit_ms, held.sequence)
@@ -555,6 +592,7 @@ class Deconfliction:
             held = transaction.held_after(now, sorted({entry.sequence for entry in entries}))
             index.release(held.block, held.enter_ms, held.exit_ms)
             index.reserve(held.block, held.enter_ms, held.exit_ms, held.sequence)
+        transaction.seen()
         if now - self._forgotten_ms >= _FORGET_EVERY_MS:
             index.forget_before(now)
             self._forgotten_ms = now
@@ -587,8 +625,8 @@ class Deconfliction:
         self, transaction: Transaction, now: int, intent_id: str, submission: Submission, key: IdempotencyKey | None
     ) -> Outcome:
         if key is not None:
-            self._forget_answers(transaction, now)
-            first = transaction.answer_to(submission.operator, key.key)
+            since_ms = self._surely(now) - self._policy.idempotency_ms
+            first = transaction.answer_to(submission.operator, key.key, since_ms)
             if first is not None and first.body_digest != key.body_digest:
                 raise IdempotencyKeyReused(
                     f"Idempotency-Key {key.key!r} came with another body before; use a new key for a new request"

@@ -16,7 +16,7 @@ from app.gate import Gate
 from app.routes import aircraft_types, airspace, events, flight_intents, health, metrics
 from app.service import Service
 from app.settings import Settings
-from app.times import now_ms
+from app.times import monotonic_ms, now_ms
 from app.tracing import Tracing
 
 DESCRIPTION = """
@@ -37,7 +37,13 @@ class State(TypedDict):
     service: Service
 
 
-def create_app(settings: Settings, clock: Callable[[], int] = now_ms, *, running: Service | None = None) -> FastAPI:
+def create_app(
+    settings: Settings,
+    clock: Callable[[], int] = now_ms,
+    *,
+    elapsed_ms: Callable[[], int] = monotonic_ms,
+    running: Service | None = None,
+) -> FastAPI:
     """Return the application for these settings. Its lifespan starts a service, unless one is `running` already."""
 
     @asynccontextmanager
@@ -45,7 +51,7 @@ def create_app(settings: Settings, clock: Callable[[], int] = now_ms, *, running
         if running is not None:
             yield {"service": running}
             return
-        starting = service.running(settings, clock)
+        starting = service.running(settings, clock, elapsed_ms)
         started = await to_thread.run_sync(starting.__enter__)
         try:
             yield {"service": started}

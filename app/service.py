@@ -19,6 +19,7 @@ from app.ledger import Ledger, create_or_upgrade, open_ledger
 from app.ledger_probe import LedgerProbe
 from app.metrics import Metrics
 from app.settings import Settings
+from app.times import monotonic_ms
 from planner.aircraft import AircraftType, merged, read_aircraft_types, shipped_aircraft_types
 from planner.airspace import Airspace, read_airspace
 from planner.buildings import shipped_airspace
@@ -79,9 +80,11 @@ def load_aircraft_types(settings: Settings) -> dict[str, AircraftType]:
 
 
 @contextmanager
-def running(settings: Settings, clock: Callable[[], int]) -> Iterator[Service]:
+def running(
+    settings: Settings, clock: Callable[[], int], elapsed_ms: Callable[[], int] = monotonic_ms
+) -> Iterator[Service]:
     """Prepare and start a service of one process; raises as `prepare`."""
-    with started(prepare(settings), clock) as service:
+    with started(prepare(settings), clock, elapsed_ms) as service:
         yield service
 
 
@@ -128,7 +131,12 @@ def prepare(settings: Settings) -> Basis:
 
 
 @contextmanager
-def started(basis: Basis, clock: Callable[[], int], on_death: Callable[[], None] = lambda: None) -> Iterator[Service]:
+def started(
+    basis: Basis,
+    clock: Callable[[], int],
+    elapsed_ms: Callable[[], int] = monotonic_ms,
+    on_death: Callable[[], None] = lambda: None,
+) -> Iterator[Service]:
     """Start a process's parts in order, and stop them in reverse.
 
     `on_death` is called, in another thread, when the writer has ended by itself, after which nothing is written.
@@ -145,7 +153,7 @@ def started(basis: Basis, clock: Callable[[], int], on_death: Callable[[], None]
         metrics = Metrics()
         deconfliction = None
         if not settings.read_only:
-            deconfliction = _writer(basis, ledger, clock, metrics, on_death)
+            deconfliction = _writer(basis, ledger, clock, elapsed_ms, metrics, on_death)
         try:
             yield Service(
                 settings=settings,
@@ -166,6 +174,7 @@ def _writer(
     basis: Basis,
     ledger: Ledger,
     clock: Callable[[], int],
+    elapsed_ms: Callable[[], int],
     metrics: Metrics,
     on_death: Callable[[], None],
 ) -> Deconfliction:
@@ -179,7 +188,14 @@ def _writer(
         retention_ms=None if settings.retention_days is None else int(settings.retention_days * 86_400_000),
     )
     deconfliction = Deconfliction(
-        ledger, planner, basis.performances(), clock, policy, observe=metrics.batch, on_death=on_death
+        ledger,
+        planner,
+        basis.performances(),
+        clock,
+        policy,
+        elapsed_ms=elapsed_ms,
+        observe=metrics.batch,
+        on_death=on_death,
     )
     deconfliction.start()
     metrics.index_loaded(len(planner.index))

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from planner.cfa_star import Search
@@ -41,6 +41,15 @@ class Settings(BaseSettings):
     allow_unauthenticated: bool = False
     log_format: Literal["console", "json"] = "console"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @model_validator(mode="after")
+    def _keys_do_not_outlive_intents(self) -> "Settings":
+        if self.retention_days is not None and self.retention_days * 24 < self.idempotency_hours:
+            raise ValueError(
+                f"retention_days ({self.retention_days:g}) is shorter than idempotency_hours "
+                f"({self.idempotency_hours:g}); shorten AIRMATRIX_IDEMPOTENCY_HOURS too"
+            )
+        return self
 
     @classmethod
     def given(cls, **options: object) -> "Settings":

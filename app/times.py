@@ -24,6 +24,11 @@ def now_ms() -> int:
     return time.time_ns() // 1_000_000
 
 
+def monotonic_ms() -> int:
+    """Return the time since some moment; it never jumps."""
+    return time.monotonic_ns() // 1_000_000
+
+
 def parse_time(text: Any) -> int:
     """Return an RFC 3339 time with any offset in ms, finer fractions rounded up; `ValueError` says what is wrong."""
     if isinstance(text, int) and not isinstance(text, bool):

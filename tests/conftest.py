@@ -82,5 +82,5 @@ def settings(tmp_path: Path, ledger: str) -> Settings:
 @pytest.fixture
 def client(settings: Settings, clock: FakeClock) -> Iterator[Client]:
     """Return a client of a running service over the old town."""
-    with served(create_app(settings, clock)) as client:
+    with served(create_app(settings, clock, elapsed_ms=clock)) as client:
         yield client

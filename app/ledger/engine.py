@@ -10,12 +10,12 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, insert, select, update
+from sqlalchemy import Connection, Engine, insert, select
 from sqlalchemy.exc import DatabaseError
 
 from app.errors import AirspaceMismatch, LedgerOutdated, StartupError
 from app.ledger import tables
-from app.ledger.ledger import Ledger, cause_of
+from app.ledger.ledger import Ledger, cause_of, touch
 from app.ledger.location import Location, parse_location
 from app.ledger.postgresql import PostgresqlDatabase
 from app.ledger.rows import HeldReservations
@@ -101,7 +101,7 @@ def open_ledger(location: str, airspace: Airspace, *, claim: bool = False) -> Le
             )
         if claim:
             # A lock can be had on what cannot be written; now is the time to notice.
-            connection.execute(update(tables.counters).values(revision=tables.counters.c.revision))
+            touch(connection)
     return Ledger(database.engine(writes=True), database.engine(writes=False), database.insert_reservations, airspace)
 
 

@@ -13,8 +13,9 @@ from itertools import takewhile
 from typing import Any
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, Engine, and_, case, delete, func, insert, select, update
-from sqlalchemy.exc import DBAPIError, IntegrityError
+from sqlalchemy import ColumnElement, Connection, Engine, and_, case, delete, func, insert, select, tuple_, update
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
@@ -24,6 +25,8 @@ from planner.airmatrix import IntArray
 from planner.airspace import Airspace
 from planner.path import Trajectory
 
+# In a connection's notes.
+_SEEN = "airmatrix has seen this database"
 # Databases bound how many values a statement may name.
 _BOUND_AT_ONCE = 10_000
 
@@ -58,6 +61,7 @@ class IdempotencyRecord:
     body_digest: str
     intent: FlightIntent
     answer: bytes
+    created_ms: int
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ class Ledger:
         """
         try:
             connection = self._writer.connect()
-        except DBAPIError as error:
+        except (DBAPIError, PoolTimeout) as error:
             raise LedgerUnavailable(f"the ledger cannot be opened: {cause_of(error)}") from error
         try:
             try:
@@ -107,6 +111,9 @@ class Ledger:
                 transaction = Transaction(connection, self._airspace, self._insert_reservations)
                 yield transaction
                 transaction.flush()
+            except DataError as error:
+                connection.rollback()
+                raise ConstraintViolated(cause_of(error)) from error
             except DBAPIError as error:
                 connection.invalidate()
                 raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
@@ -129,21 +136,11 @@ class Ledger:
                 connection.close()
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the write lock, write nothing: whatever was being written before has happened by now, or never will."""
-        try:
-            with self._writer.connect() as connection:
-                connection.begin()
-                yield
-        except DBAPIError as error:
-            raise LedgerUnavailable(f"the ledger cannot be locked: {cause_of(error)}") from error
-
-    @contextmanager
     def _reading(self) -> Iterator[Connection]:
         try:
             with self._reader.begin() as connection:
                 yield connection
-        except DBAPIError as error:
+        except (DBAPIError, PoolTimeout) as error:
             raise LedgerUnavailable(f"the ledger cannot be read: {cause_of(error)}") from error
 
     def revision(self) -> int:
@@ -205,15 +202,18 @@ class Ledger:
         intents = [to_intent(row, self._airspace, owned.pop(row.sequence, Reservations.none())) for row in rows]
         return intents, owned
 
-    def held_between(self, from_ms: int, to_ms: int, block: int | None = None) -> HeldReservations:
-        """Return the reservations that overlap [from, to), by block and enter."""
+    def held_between(
+        self, from_ms: int, to_ms: int, block: int | None = None
+    ) -> tuple[HeldReservations, dict[int, str]]:
+        """Return the reservations that overlap [from, to), by block and enter, and the ids of their intents."""
         query = select(reservations).where(reservations.c.enter < to_ms, reservations.c.exit > from_ms)
         if block is None:
             query = query.where(_in_the_air(from_ms, to_ms))
         else:
             query = query.where(reservations.c.block == block)
         with self._reading() as connection:
-            return to_held(connection.execute(query.order_by(reservations.c.block, reservations.c.enter)))
+            held = to_held(connection.execute(query.order_by(reservations.c.block, reservations.c.enter)))
+            return held, _ids(connection, held.sequence.tolist())
 
     def use_between(self, from_ms: int, to_ms: int) -> tuple[IntArray, IntArray]:
         """Return the blocks reserved within [from, to), and for how many ms of it: two arrays (n,)."""
@@ -229,11 +229,6 @@ class Ledger:
         with self._reading() as connection:
             rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 2)
         return rows[:, 0], rows[:, 1]
-
-    def ids(self, sequences: Iterable[int]) -> dict[int, str]:
-        """Return the ids of intents by their sequence numbers."""
-        with self._reading() as connection:
-            return _ids(connection, sequences)
 
     def journal_after(self, revision: int, limit: int) -> list[JournalEntry]:
         """Return up to `limit` journal entries after a revision, oldest first."""
@@ -253,7 +248,6 @@ class Transaction:
         self._insert_reservations = insert_reservations
         self._counters = self._written = _Counters(*connection.execute(select(*_COUNTERS)).one())
         self._forget_pending()
-        self._answers_forgotten_ms: int | None = None
         self.write_s = 0.0
         self.commit_s = 0.0
 
@@ -283,12 +277,18 @@ class Transaction:
             with self._connection.begin_nested():
                 yield
                 self.flush()
+        except DataError as error:
+            self._undo(before)
+            raise ConstraintViolated(cause_of(error)) from error
         except DBAPIError as error:
             raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
         except BaseException:
-            self._counters = self._written = before
-            self._forget_pending()
+            self._undo(before)
             raise
+
+    def _undo(self, before: "_Counters") -> None:
+        self._counters = self._written = before
+        self._forget_pending()
 
     def record(
         self,
@@ -359,20 +359,28 @@ class Transaction:
         query = select(reservations).where(reservations.c.exit > time_ms)
         if sequences is not None:
             query = query.where(reservations.c.intent.in_(sequences))
+        else:
+            # Found by their flights: the ledger may hold years of reservations.
+            query = query.where(_in_the_air(time_ms, None))
         return to_held(self._connection.execute(query.order_by(reservations.c.intent)))
 
-    def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
-        """Return the first answer to an idempotency key, None if it is new."""
+    def answer_to(self, operator: str, key: str, since_ms: int) -> IdempotencyRecord | None:
+        """Return the first answer to an idempotency key, None if it is new; one from before `since_ms` is dropped."""
         new = self._new_answers.get((operator, key))
         if new is not None:
             return new
-        return _answer_to(self._connection, self._airspace, operator, key)
+        found = _answer_to(self._connection, self._airspace, operator, key)
+        if found is None or found.created_ms >= since_ms:
+            return found
+        this = (idempotency_keys.c.operator == operator) & (idempotency_keys.c.key == key)
+        self._connection.execute(delete(idempotency_keys).where(this))
+        return None
 
     def remember_answer(
         self, operator: str, key: str, body_digest: str, intent: FlightIntent, answer: bytes, now_ms: int
     ) -> None:
         """Keep the first answer to an idempotency key."""
-        self._new_answers[operator, key] = IdempotencyRecord(body_digest, intent, answer)
+        self._new_answers[operator, key] = IdempotencyRecord(body_digest, intent, answer, now_ms)
         self._new_keys.append(
             {
                 "operator": operator, "key": key, "body_digest": body_digest,
@@ -380,12 +388,16 @@ class Transaction:
             }
         )  # fmt: skip
 
-    def forget_answers(self, before_ms: int) -> None:
-        """Drop idempotency keys first used before a time; asked for the same again in a transaction, do nothing."""
-        if before_ms == self._answers_forgotten_ms:
-            return
-        self._answers_forgotten_ms = before_ms
-        self._connection.execute(delete(idempotency_keys).where(idempotency_keys.c.created < before_ms))
+    def remove_answers(self, before_ms: int, limit: int) -> int:
+        """Drop up to `limit` idempotency keys first used before a time; return how many."""
+        self.flush()
+        name = tuple_(idempotency_keys.c.operator, idempotency_keys.c.key)
+        created = idempotency_keys.c.created
+        query = select(idempotency_keys.c.operator, idempotency_keys.c.key).where(created < before_ms)
+        old = [tuple(row) for row in self._connection.execute(query.order_by(created).limit(limit))]
+        if old:
+            self._connection.execute(delete(idempotency_keys).where(name.in_(old)))
+        return len(old)
 
     def remove_ended(self, before_ms: int, limit: int) -> int:
         """Remove up to `limit` intents that ended before a time, with all they held; return how many.
@@ -418,18 +430,23 @@ class Transaction:
             self._connection.execute(delete(journal).where(journal.c.revision <= old[-1].revision))
         return len(old)
 
-    def seen(self, now_ms: int) -> int:
-        """Return a process's `now`, or when the newest change was recorded if that is earlier.
-
-        What is old is old by both: a clock that is wrong makes nothing old by itself.
-        """
+    def newest_change(self) -> int | None:
+        """Return when the newest change was recorded, None if there has been none."""
         query = select(journal.c.time).order_by(journal.c.revision.desc()).limit(1)
-        newest_ms = self._connection.execute(query).scalar_one_or_none()
-        return 0 if newest_ms is None else min(now_ms, newest_ms)
+        return self._connection.execute(query).scalar_one_or_none()
+
+    @property
+    def on_new_connection(self) -> bool:
+        """Whether nobody has called `seen` on this connection: it may lead to another database than before."""
+        return _SEEN not in self._connection.info
+
+    def seen(self) -> None:
+        """Take down that what this connection leads to is known."""
+        self._connection.info[_SEEN] = True
 
     def touch(self) -> None:
         """Write something that changes nothing: a commit that succeeds proves that the ledger can be written."""
-        self._connection.execute(update(counters).values(revision=counters.c.revision))
+        touch(self._connection)
 
     def flush(self) -> None:
         """Write the rows that wait, and how far the counters have come; raises `ConstraintViolated`."""
@@ -489,6 +506,12 @@ class _Counters:
 _COUNTERS = [counters.c[field.name] for field in fields(_Counters)]
 
 
+def touch(connection: Connection) -> None:
+    """Change a row and change it back: SQLite writes nothing for an update to what is there already."""
+    for step in (1, -1):
+        connection.execute(update(counters).values(revision=counters.c.revision + step))
+
+
 def cause_of(error: BaseException) -> str:
     """Return what a database says in one line."""
     return " ".join(str(getattr(error, "orig", None) or error).split())
@@ -512,7 +535,7 @@ def _answer_to(connection: Connection, airspace: Airspace, operator: str, key: s
         return None
     intent = _find(connection, airspace, row.id)
     assert intent is not None
-    return IdempotencyRecord(row.body_digest, intent, row.answer.encode())
+    return IdempotencyRecord(row.body_digest, intent, row.answer.encode(), row.created)
 
 
 def _reservations(connection: Connection, airspace: Airspace, sequences: Sequence[int]) -> dict[int, Reservations]:
@@ -521,14 +544,15 @@ def _reservations(connection: Connection, airspace: Airspace, sequences: Sequenc
     return by_intent(to_held(connection.execute(query)), sequences, airspace.grid)
 
 
-def _in_the_air(from_ms: int, to_ms: int) -> ColumnElement[bool]:
-    """Return the condition that a reservation belongs to a flight in the air within [from, to), for use with others."""
-    earliest = from_ms - select(counters.c.longest_flight).scalar_subquery()
-    return reservations.c.intent.in_(
-        select(flight_intents.c.sequence).where(
-            flight_intents.c.departure.between(earliest, to_ms), flight_intents.c.arrival >= from_ms
-        )
-    )
+def _in_the_air(from_ms: int, to_ms: int | None) -> ColumnElement[bool]:
+    """Return the condition that a reservation belongs to a flight in the air within [from, to), or at any time after
+    `from`; for use with others.
+    """
+    departure, arrival = flight_intents.c.departure, flight_intents.c.arrival
+    in_time = [departure >= from_ms - select(counters.c.longest_flight).scalar_subquery(), arrival >= from_ms]
+    if to_ms is not None:
+        in_time.append(departure <= to_ms)
+    return reservations.c.intent.in_(select(flight_intents.c.sequence).where(*in_time))
 
 
 def _ids(connection: Connection, sequences: Iterable[int]) -> dict[int, str]:

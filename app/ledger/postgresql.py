@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Dialect, Engine, create_engine, event
 
 from app.errors import ForeignLedger, LedgerMissing
 from app.ledger.location import Location
@@ -10,8 +10,8 @@ from app.ledger.rows import HeldReservations
 
 # "AMTX": the first half of the keys of our advisory locks.
 _LOCKS = 0x414D5458
-# As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
-_READERS = 40
+# Servers allow a hundred connections by default, for all processes together; who finds none free waits a little.
+_READERS, _WAIT_S = 10, 5
 # A server that does not answer is given up after some seconds, not when TCP gives up.
 _CONNECT = {
     "connect_timeout": 5,
@@ -47,6 +47,8 @@ class PostgresqlDatabase:
         tables, marks = connection.exec_driver_sql(
             "SELECT count(*), count(*) FILTER (WHERE obj_description(oid, 'pg_class') = 'AirMatrix ledger')"
             " FROM pg_class WHERE relnamespace = current_schema()::regnamespace AND relkind IN ('r', 'p', 'v', 'm')"
+            # Extensions bring tables of their own.
+            " AND NOT EXISTS (SELECT 1 FROM pg_depend WHERE objid = pg_class.oid AND deptype = 'e')"
         ).one()
         if tables and not marks:
             raise ForeignLedger(f"{self.location} has tables, but is no AirMatrix ledger; nothing was changed in it")
@@ -63,12 +65,25 @@ class PostgresqlDatabase:
             self.location.url,
             pool_size=1 if writes else _READERS,
             max_overflow=0,
+            pool_timeout=_WAIT_S,
             # Restarts of the server show here, not in the first request after them.
             pool_pre_ping=True,
             isolation_level="READ COMMITTED" if writes else "REPEATABLE READ",
             connect_args=_CONNECT,
             execution_options={} if writes else {"postgresql_readonly": True},
         )
+
+        @event.listens_for(engine, "do_connect")
+        def connect(dialect: Dialect, _record: object, arguments: list[Any], parameters: dict[str, Any]) -> Any:
+            connection: Any = dialect.connect(*arguments, **parameters)
+            encoding = connection.info.parameter_status("server_encoding")
+            if encoding != "UTF8":
+                connection.close()
+                raise ForeignLedger(
+                    f"{self.location} is encoded in {encoding}, in which not every name can be written; "
+                    "make it with: createdb --encoding UTF8 --template template0"
+                )
+            return connection
 
         @event.listens_for(engine, "connect")
         def configure(connection: Any, _record: object) -> None:

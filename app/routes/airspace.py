@@ -233,7 +233,8 @@ def read_status(
     """Return green, yellow and red blocks. Without telemetry, which comes later, every reserved block is green."""
     grid = service.airspace.grid
     at_ms = service.clock() if at is None else at
-    in_use = statuses(service.ledger.held_between(at_ms, at_ms + 1))
+    held, ids = service.ledger.held_between(at_ms, at_ms + 1)
+    in_use = statuses(held)
     keep = _within(grid, np.array([entry.block for entry in in_use], dtype=np.int64), bbox)
     if layer is not None:
         _check_layer(service, layer)
@@ -242,7 +243,6 @@ def read_status(
         for entry, inside in zip(in_use, keep.tolist(), strict=True)
         if inside and status in (None, entry.status) and layer in (None, grid.block(entry.block)[2])
     ]
-    ids = service.ledger.ids([sequence for entry in shown for sequence in entry.sequences])
     blocks = [_block_status(grid, entry, ids) for entry in shown]
     if f == "geojson" or (f is None and GEOJSON in (accept or "")):
         return _geojson(
@@ -287,9 +287,8 @@ def read_block(
     block = grid.index((i, j, k))
     now_ms = service.clock()
     from_ms, to_ms = _span(now_ms if from_ is None else from_, LATEST_MS if to is None else to)
-    held = service.ledger.held_between(from_ms, to_ms, block)
-    ids = service.ledger.ids(held.sequence.tolist())
-    present = statuses(service.ledger.held_between(now_ms, now_ms + 1, block))
+    held, ids = service.ledger.held_between(from_ms, to_ms, block)
+    present = statuses(service.ledger.held_between(now_ms, now_ms + 1, block)[0])
     x, y, base_m = (
         grid.centres(np.array([block]))[0] - np.array([grid.block_side_m, grid.block_side_m, grid.block_height_m]) / 2
     )

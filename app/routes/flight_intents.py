@@ -3,6 +3,7 @@
 import hashlib
 import time
 from typing import Annotated, Any
+from uuid import UUID
 
 import numpy as np
 import orjson
@@ -198,7 +199,7 @@ async def preview(service: ServiceDep, body: FlightIntentBody) -> Response:
 )
 def list_flight_intents(
     service: ServiceDep,
-    operator: str | None = None,
+    operator: Label | None = None,
     state: State | None = None,
     from_: Annotated[
         Timestamp | None, Query(alias="from", description="Flights that arrive at this time or later.")
@@ -226,7 +227,7 @@ def list_flight_intents(
 )
 def read(service: ServiceDep, intent_id: str) -> Response:
     """Return an intent with the reservations it still holds."""
-    intent = service.ledger.find(intent_id)
+    intent = service.ledger.find(_id(intent_id))
     if intent is None:
         removed_ms = service.ledger.removed().before_ms
         hint = "" if removed_ms is None else f"; those that ended before {format_time(removed_ms)} have been removed"
@@ -242,7 +243,7 @@ def read(service: ServiceDep, intent_id: str) -> Response:
 )
 async def cancel(service: ServiceDep, intent_id: str) -> Response:
     """Cancel an intent. Before departure its blocks are free at once; a departed flight keeps them until arrival."""
-    return _intent_response(service, await service.writer.cancel(intent_id))
+    return _intent_response(service, await service.writer.cancel(_id(intent_id)))
 
 
 def render(grid: AirMatrix, intent: FlightIntent) -> dict[str, Any]:
@@ -263,6 +264,15 @@ def render(grid: AirMatrix, intent: FlightIntent) -> dict[str, Any]:
             "earliest_feasible_departure": None if feasible_ms is None else format_time(feasible_ms),
         }
     return answer
+
+
+def _id(text: str) -> str:
+    """Return the id in a path; what is no UUID is the id of nothing, and no database's business."""
+    try:
+        UUID(text)
+    except ValueError:
+        raise UnknownFlightIntent(f"there is no flight intent {text}") from None
+    return text
 
 
 def _located(service: Service, body: FlightIntentBody) -> Submission:

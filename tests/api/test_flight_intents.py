@@ -306,6 +306,8 @@ def test_a_preview_is_refused_as_a_submission_is(client: Client, path: str) -> N
 
 
 def test_an_unknown_intent_is_a_problem(client: Client) -> None:
+    problem(client.get(f"{SUBMIT}/%00"), 404, "unknown-flight-intent")
+    problem(client.get(SUBMIT, params={"operator": "\0"}), 422, "validation-error")
     answer = problem(client.get(f"{SUBMIT}/0193-no-such"), 404, "unknown-flight-intent")
     assert answer["detail"] == "there is no flight intent 0193-no-such"
 
@@ -354,7 +356,8 @@ def test_a_refused_intent_cannot_be_cancelled(street: Client) -> None:
 
 
 def test_an_unknown_intent_cannot_be_cancelled(client: Client) -> None:
-    problem(client.delete(f"{SUBMIT}/0193-no-such"), 404, "unknown-flight-intent")
+    for name in ("0193-no-such", "%00", "01a2025d-cf8d-7793-bfd6-fd7be76cdfea"):
+        problem(client.delete(f"{SUBMIT}/{name}"), 404, "unknown-flight-intent")
 
 
 # Listing

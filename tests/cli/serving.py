@@ -67,11 +67,11 @@ def started(
     program: Sequence[str | Path] = (AIRMATRIX,),
     **variables: str,
 ) -> Iterator["subprocess.Popen[bytes]"]:
-    """Start `airmatrix serve` in a folder and a process group; it is ended afterwards if it still runs."""
+    """Start `airmatrix serve` in a folder; it is ended afterwards if it still runs."""
     with (folder / log).open("wb") as stderr:
         process = subprocess.Popen(
             [*program, "serve", *options],
-            cwd=folder, env=environment(**variables), stderr=stderr, start_new_session=True,
+            cwd=folder, env=environment(**variables), stderr=stderr,
         )  # fmt: skip
     try:
         yield process

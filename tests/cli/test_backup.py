@@ -87,7 +87,8 @@ def test_commits_meanwhile_neither_get_into_a_backup_nor_make_it_begin_anew(tmp_
 
         def write_meanwhile(copied: float) -> None:
             steps.append(copied)
-            writer.execute("INSERT INTO filler (text) VALUES ('meanwhile')")
+            if len(steps) < 100:
+                writer.execute("INSERT INTO filler (text) VALUES ('meanwhile')")
 
         back_up(str(ledger), copy, advance=write_meanwhile)
     assert steps == sorted(steps)
@@ -143,10 +144,23 @@ def test_what_is_no_ledger_is_not_backed_up(airmatrix: Run, tmp_path: Path) -> N
     assert names(tmp_path) == ["recipes.sqlite"]
 
 
-def test_a_damaged_ledger_is_reported_and_no_copy_kept(airmatrix: Run, history: History, tmp_path: Path) -> None:
+def test_a_damaged_ledger_is_reported_and_no_copy_kept(airmatrix: Run, ledger: Path) -> None:
+    with database(ledger) as connection:
+        # Pages that belong to nothing any more: not in the way of copying.
+        connection.execute("CREATE TABLE filler (text TEXT)")
+        connection.execute("PRAGMA writable_schema = ON")
+        connection.execute("DELETE FROM sqlite_schema WHERE name = 'filler'")
+    before = names(ledger.parent)
+    airmatrix("db", "backup", "--ledger", ledger, "--out", "copy.sqlite").assert_refused(
+        f"ledger {ledger} is damaged, so no copy was kept", "never used"
+    )
+    assert names(ledger.parent) == before
+
+
+def test_a_ledger_that_cannot_be_read_is_reported(airmatrix: Run, history: History, tmp_path: Path) -> None:
     damaged = bytearray(history.ledger.read_bytes())
-    # The upper half of its pages, which hold no schema.
-    damaged[len(damaged) // 2 :: 7] = bytes(len(damaged[len(damaged) // 2 :: 7]))
+    # The first page, after the header: the schema.
+    damaged[100:4096] = bytes(4096 - 100)
     (tmp_path / "damaged.sqlite").write_bytes(damaged)
     airmatrix("db", "backup", "--ledger", "damaged.sqlite", "--out", "copy.sqlite").assert_refused("damaged.sqlite")
     assert names(tmp_path) == ["damaged.sqlite"]

@@ -172,6 +172,7 @@ def test_the_table_says_what_the_service_recorded(airmatrix: Run, town: Server) 
     refused = {label.removeprefix("refused: "): int(outcome.table[label]) for label in labels(outcome, "refused: ")}
     assert refused == dict(reasons)
     assert labels(outcome, "problem") == labels(outcome, "connection") == []
+    assert labels(outcome, "of it") == ["of it queue", "of it plan", "of it commit", "of it serialise"]
     assert outcome.out.startswith("town, containment, safe-interval")
 
 

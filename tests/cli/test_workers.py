@@ -1,8 +1,11 @@
 """`airmatrix serve --workers N`: one port, one ledger, several processes that come and go."""
 
+import json
 import os
+import resource
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +14,8 @@ from contextlib import suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
+from threading import Timer
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -21,8 +26,8 @@ from app.errors import StartupError
 from app.times import now_ms
 from app.workers import Workers
 from tests.cli import working
-from tests.cli.conftest import Run
-from tests.cli.serving import Server, serving
+from tests.cli.conftest import AIRCRAFT_TYPES, Run
+from tests.cli.serving import AIRMATRIX, Server, environment, serving
 from tests.cli.test_serve import foreign_database, names, serve
 from tests.cli.town import along_row
 from tests.ledger.locations import write_lock
@@ -63,11 +68,11 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> tuple[str | Path, ...]:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory, town_file: Path, faulty: tuple[str | Path, ...]) -> Iterator[Server]:
-    """Two workers with an airspace file of their own. Each test leaves two that are ready."""
+    """Two workers with an aircraft file of their own. Each test leaves two that are ready."""
     folder = tmp_path_factory.mktemp("pair")
-    (folder / "town.geojson").write_bytes(town_file.read_bytes())
-    options = ("--airspace", "town.geojson", "--workers", "2")
-    with serving(folder, *options, program=faulty, TMPDIR=str(folder), **JSON) as server:
+    (folder / "aircraft.toml").write_text(AIRCRAFT_TYPES)
+    options = ("--airspace", str(town_file), "--aircraft-types", "aircraft.toml", "--workers", "2")
+    with serving(folder, *options, program=faulty, **JSON) as server:
         yield server
 
 
@@ -182,14 +187,35 @@ def test_a_worker_whose_writer_died_is_replaced(pair: Server) -> None:
 
 
 def test_a_worker_that_would_differ_from_the_others_does_not_start_until_it_would_not(pair: Server) -> None:
-    airspace, mislaid = pair.folder / "town.geojson", pair.folder / "mislaid"
-    airspace.rename(mislaid)
+    types = pair.folder / "aircraft.toml"
+    types.write_text(AIRCRAFT_TYPES.replace("mass_kg = 5.0", "mass_kg = 6.0"))
     before = pair.workers()
     os.kill(min(before), signal.SIGKILL)
     until(lambda: pair.entries("worker cannot start"))
+    assert "have changed" in pair.entries("worker cannot start")[0]["error"]
     assert submitted(pair).status_code == 201
-    mislaid.rename(airspace)
+    types.write_text(AIRCRAFT_TYPES)
     until(lambda: len(pair.workers() - before) == 1)
+
+
+def test_workers_are_replaced_although_nobody_reads_the_log(tmp_path: Path, town_file: Path) -> None:
+    command = [str(AIRMATRIX), "serve", "--port", "0", "--airspace", str(town_file), "--workers", "2"]
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment(**JSON), stderr=subprocess.PIPE)
+    assert process.stderr is not None
+    lines: list[dict[str, Any]] = []
+    try:
+        while not lines or lines[-1]["event"] != "listening":
+            lines.append(json.loads(process.stderr.readline()))
+        process.stderr.close()
+        server = Server(lines[-1]["url"], tmp_path, tmp_path / "serve.log", process)
+        for line in lines:
+            if line["event"] == "worker is ready":
+                os.kill(line["worker"], signal.SIGKILL)
+        assert submitted(server).status_code == 201
+        assert process.poll() is None
+    finally:
+        process.terminate()
+        process.wait(15)
 
 
 def test_a_service_of_one_process_whose_writer_died_ends(
@@ -225,8 +251,7 @@ def test_what_is_refused_is_refused_once_and_before_any_worker_starts(tmp_path: 
 
 def test_a_stopped_service_finishes_what_its_workers_took(tmp_path: Path, town_file: Path) -> None:
     options = ("--airspace", str(town_file), "--workers", "2")
-    with serving(tmp_path, *options, TMPDIR=str(tmp_path), **JSON) as server, ThreadPoolExecutor(6) as clients:
-        metrics = [name for name in names(tmp_path) if name.startswith("airmatrix-metrics-")]
+    with serving(tmp_path, *options, **JSON) as server, ThreadPoolExecutor(6) as clients:
         with write_lock(server.ledger):
             answers = [clients.submit(submitted, server) for _ in range(6)]
             # The others are with the writers already.
@@ -237,12 +262,22 @@ def test_a_stopped_service_finishes_what_its_workers_took(tmp_path: Path, town_f
         assert [answer.result().status_code for answer in answers] == [201] * 6
         assert server.process.wait(15) == 0
     assert "Traceback" not in server.log.read_text()
-    assert len(metrics) == 1
-    assert metrics[0] not in names(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="the environment of a process cannot be seen here")
+def test_what_workers_add_up_their_metrics_in_is_gone_when_they_are(tmp_path: Path, town_file: Path) -> None:
+    with serving(tmp_path, "--airspace", str(town_file), "--workers", "2", **JSON) as server:
+        variables = Path(f"/proc/{min(server.workers())}/environ").read_text().split("\0")
+        (folder,) = (Path(text.partition("=")[2]) for text in variables if text.startswith("PROMETHEUS_MULTIPROC_DIR="))
+        assert any(folder.iterdir())
+        assert server.stop() == 0
+    assert not folder.exists()
 
 
 def test_interrupting_from_a_terminal_ends_all_processes_quietly(tmp_path: Path, town_file: Path) -> None:
-    with serving(tmp_path, "--airspace", str(town_file), AIRMATRIX_WORKERS="2", **JSON) as server:
+    in_front = (sys.executable, "-c", "import os, sys; os.setpgrp(); os.execv(sys.argv[1], sys.argv[1:])", AIRMATRIX)
+    options = ("--airspace", str(town_file))
+    with serving(tmp_path, *options, program=in_front, AIRMATRIX_WORKERS="2", **JSON) as server:
         pids = server.workers()
         assert len(pids) == 2
         os.killpg(server.process.pid, signal.SIGINT)
@@ -272,6 +307,38 @@ def test_workers_run_until_a_signal_and_say_which(tmp_path: Path, number: signal
     assert workers.run(partial(stop_here, number)) is number
     assert len(names(tmp_path)) == 2
     assert all(ended(int(pid)) for pid in names(tmp_path))
+
+
+def test_workers_leave_interrupting_to_their_parent(tmp_path: Path) -> None:
+    def interrupt_them() -> None:
+        for pid in names(tmp_path):
+            os.kill(int(pid), signal.SIGINT)
+        time.sleep(0.5)
+        stop_here()
+
+    Workers(2, partial(working.works, tmp_path)).run(interrupt_them)
+    assert len(names(tmp_path)) == 2
+    assert "interrupted" not in names(tmp_path)
+
+
+def test_a_worker_for_which_there_is_no_room_is_started_later(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+
+    def kill_and_take_room() -> None:
+        (pid,) = names(tmp_path)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+        Timer(1.0, give_room).start()
+        os.kill(int(pid), signal.SIGKILL)
+
+    def give_room() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        until(lambda: len(names(tmp_path)) == 2)
+        stop_here()
+
+    Workers(1, partial(working.works, tmp_path)).run(kill_and_take_room)
+    assert "no worker could be started" in capsys.readouterr().out
 
 
 def test_workers_that_cannot_start_are_not_tried_again(tmp_path: Path) -> None:

@@ -14,10 +14,13 @@ LONG_S = 60.0
 
 
 def works(folder: Path, ready: Callable[[], None]) -> None:
-    """Start and go on."""
+    """Start and go on, unless interrupted."""
     _leave_trace(folder)
     ready()
-    time.sleep(LONG_S)
+    try:
+        time.sleep(LONG_S)
+    except KeyboardInterrupt:
+        (folder / "interrupted").touch()
 
 
 def cannot_start(folder: Path, _ready: Callable[[], None]) -> None:

@@ -41,7 +41,10 @@ class FakeClock:
 
 
 class Process:
-    """Ledger connections, planner, index and writer on one migrated ledger."""
+    """Ledger connections, planner, index and writer on one migrated ledger.
+
+    What `clock` says has passed, unless `elapsed_ms` knows better.
+    """
 
     def __init__(
         self,
@@ -49,6 +52,8 @@ class Process:
         airspace: Airspace,
         clock: Callable[[], int],
         *,
+        elapsed_ms: Callable[[], int] | None = None,
+        on_death: Callable[[], None] = lambda: None,
         policy: Policy = POLICY,
         search: Search = Search.SAFE_INTERVAL,
     ) -> None:
@@ -56,7 +61,9 @@ class Process:
         self.ledger = open_ledger(location, airspace, claim=True)
         self.planner = Planner(airspace, search)
         performances = {type_.id: Performance.of(type_, airspace.grid) for type_ in shipped_aircraft_types()}
-        self.deconfliction = Deconfliction(self.ledger, self.planner, performances, clock, policy)
+        self.deconfliction = Deconfliction(
+            self.ledger, self.planner, performances, clock, policy, elapsed_ms=elapsed_ms or clock, on_death=on_death
+        )
         self.deconfliction.start()
 
     def __enter__(self) -> Self:

@@ -46,6 +46,30 @@ def test_a_foreign_database_is_refused_and_left_as_it_was(kind: str, ledgers: Le
 
 
 @on_postgresql
+@pytest.mark.parametrize("encoding", ["SQL_ASCII", "LATIN1"])
+def test_a_database_in_which_not_every_name_can_be_written_is_refused(encoding: str, ledgers: Ledgers) -> None:
+    place = ledgers.vacant()
+    name = urlsplit(place).path.removeprefix("/")
+    with database(place.replace(name, "postgres")) as admin:
+        admin.execute(f"DROP DATABASE {name}")
+        admin.execute(f"CREATE DATABASE {name} ENCODING {encoding} LOCALE 'C' TEMPLATE template0")
+    for open_ in OPENING.values():
+        with pytest.raises(ForeignLedger, match=f"is encoded in {encoding}, .* createdb --encoding UTF8"):
+            open_(place)
+
+
+@on_postgresql
+def test_tables_that_an_extension_brought_are_no_obstacle(ledgers: Ledgers) -> None:
+    place = ledgers.vacant()
+    with database(place) as connection:
+        connection.execute("CREATE TABLE settings (name text)")
+        connection.execute("CREATE EXTENSION btree_gist")
+        connection.execute("ALTER EXTENSION btree_gist ADD TABLE settings")
+    create_or_upgrade(place)
+    open_ledger(place, AIRSPACE, claim=True).close()
+
+
+@on_postgresql
 def test_a_database_may_hold_a_ledger_in_each_of_its_schemas(ledgers: Ledgers) -> None:
     place = ledgers.vacant()
     cities = {name: f"{place}?options=-csearch_path%3D{name}" for name in ("astana", "singapore")}

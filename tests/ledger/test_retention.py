@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 
-from app.errors import DepartureInThePast
 from app.flight_intents import FlightIntent, State
 from tests.ledger.district import SQUARE, STREET
 from tests.ledger.locations import database
@@ -86,14 +85,39 @@ def test_an_intent_stays_while_its_idempotency_key_is_kept(ledger: str, clock: F
     assert kept(ledger)[0] == [3]
 
 
-def test_a_clock_that_is_far_ahead_removes_nothing_by_itself(ledger: str, clock: FakeClock) -> None:
-    with Process(ledger, SQUARE.airspace, clock, policy=AN_HOUR) as process:
+def test_a_clock_that_is_far_ahead_removes_nothing_that_is_still_to_come(ledger: str, clock: FakeClock) -> None:
+    elapsed = FakeClock(0)
+    with Process(ledger, SQUARE.airspace, clock, elapsed_ms=elapsed, policy=AN_HOUR) as process:
+        tomorrow = process.submit(SQUARE.submission("N", "S", earliest_ms=clock.now_ms + DAY_MS))
+        request = SQUARE.submission("N", "S", window_ms=10 * DAY_MS)
+        first = process.submit(request, key("key"))
+        clock.advance(ms=3 * DAY_MS)
+        for _ in range(3):
+            across(process, clock)
+            clock.advance(seconds=61)
+        assert process.submit(request, key("key")).id == first.id
+        clock.advance(ms=-3 * DAY_MS)
         across(process, clock)
-        right_ms = clock.now_ms
-        clock.advance(ms=20 * DAY_MS)
-        with pytest.raises(DepartureInThePast):
-            process.submit(SQUARE.submission("N", "S", earliest_ms=right_ms))
-    assert kept(ledger) == ([1], {1}, [1])
+        assert process.ledger.find(tomorrow.id) is not None
+        # When the time has really passed, they go.
+        clock.advance(ms=5 * DAY_MS)
+        elapsed.advance(ms=5 * DAY_MS)
+        across(process, clock)
+        asyncio.run(until(lambda: process.ledger.find(tomorrow.id) is None))
+
+
+def test_a_machine_that_starts_with_a_clock_far_ahead_removes_nothing_that_is_still_to_come(
+    ledger: str, clock: FakeClock
+) -> None:
+    with Process(ledger, SQUARE.airspace, clock, policy=AN_HOUR) as process:
+        tomorrow = process.submit(SQUARE.submission("N", "S", earliest_ms=clock.now_ms + DAY_MS))
+    clock.advance(ms=3 * DAY_MS)
+    with Process(ledger, SQUARE.airspace, clock, elapsed_ms=FakeClock(0), policy=AN_HOUR) as process:
+        for _ in range(3):
+            clock.advance(seconds=61)
+            across(process, clock)
+        assert process.ledger.find(tomorrow.id) is not None
+    assert len(kept(ledger)[0]) == 4
 
 
 def test_a_process_that_lags_behind_what_is_left_of_the_journal_loads_the_ledger_afresh(
@@ -130,8 +154,8 @@ def test_a_great_deal_is_removed_step_by_step_while_nobody_asks_for_anything(led
     with Process(ledger, SQUARE.airspace, clock) as process:
         many = [SQUARE.submission("N", "S", window_ms=HOUR_MS) for _ in range(100)]
         process.together(*(process.deconfliction.submit(submission) for submission in many))
-    clock.advance(ms=DAY_MS)
     with Process(ledger, SQUARE.airspace, clock, policy=AN_HOUR) as process:
+        clock.advance(ms=DAY_MS)
         across(process, clock)
         asyncio.run(until(lambda: kept(ledger)[0] == [101]))
     assert kept(ledger) == ([101], {101}, [101])

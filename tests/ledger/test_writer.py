@@ -2,9 +2,12 @@
 
 import asyncio
 import contextlib
+import sqlite3
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Never
 from urllib.parse import urlsplit
 
@@ -20,12 +23,14 @@ from app.errors import (
     IdempotencyKeyReused,
     IllegalTransition,
     LedgerUnavailable,
+    OutcomeUnknown,
     QueueFull,
     UnknownFlightIntent,
 )
 from app.flight_intents import FlightIntent, Reservations, State, Submission
+from app.ledger import open_ledger
 from tests.ledger.district import DEPARTURE_MS, SQUARE, START_MS, STREET
-from tests.ledger.locations import database, on_postgresql, on_sqlite, write_lock
+from tests.ledger.locations import Ledgers, database, on_postgresql, on_sqlite, write_lock
 from tests.ledger.process import (
     DAY_MS,
     POLICY,
@@ -239,6 +244,49 @@ def test_a_request_that_the_database_refuses_harms_no_neighbour_in_its_batch(squ
     assert_sound(square)
 
 
+@on_postgresql
+def test_text_that_the_database_cannot_take_harms_only_who_sent_it(square: Process) -> None:
+    before, refused, after = outcomes(
+        square,
+        SQUARE.submission("N", "S"),
+        SQUARE.submission("N", "S", operator="a\x00b"),
+        SQUARE.submission("S", "N"),
+    )
+    assert isinstance(before, Outcome)
+    assert isinstance(after, Outcome)
+    assert isinstance(refused, LedgerUnavailable)
+    assert [before.intent.sequence, after.intent.sequence] == [1, 2]
+    assert square.deconfliction.trouble is None
+    assert_sound(square)
+
+
+@on_postgresql
+def test_a_process_whose_database_was_replaced_by_an_older_one_loads_it_afresh(
+    ledgers: Ledgers, clock: FakeClock
+) -> None:
+    ledger = ledgers.migrated()
+    with Process(ledger, STREET.airspace, clock) as process:
+        process.submit(STREET.submission("W", "E", earliest_ms=DEPARTURE_MS + 300_000))
+    older = ledgers.copy(ledger)
+    with Process(ledger, STREET.airspace, clock) as process:
+        lost = process.submit(STREET.submission("W", "E", window_ms=0))
+        # As after a failover to a standby that had not received the last commits.
+        name, other = (urlsplit(location).path.removeprefix("/") for location in (ledger, older))
+        with database(older.replace(other, "postgres")) as admin:
+            admin.execute("SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity WHERE datname = ?", [name])
+            admin.execute(f"ALTER DATABASE {name} RENAME TO {name}_gone")
+            admin.execute(f"ALTER DATABASE {other} RENAME TO {name}")
+        with Process(ledger, STREET.airspace, clock) as survivor:
+            survivor.submit(STREET.submission("W", "E", earliest_ms=DEPARTURE_MS + 600_000))
+        again = process.submit(STREET.submission("W", "E", window_ms=0))
+        assert (again.state, departure(again)) == (State.ACCEPTED, departure(lost))
+        assert_sound(process)
+        with database(ledger.replace(name, "postgres")) as admin:
+            admin.execute("SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity WHERE datname = ?", [name])
+            admin.execute(f"ALTER DATABASE {name} RENAME TO {other}")
+            admin.execute(f"ALTER DATABASE {name}_gone RENAME TO {name}")
+
+
 def test_reservations_that_the_index_had_missed_are_planned_around_as_soon_as_the_database_shows_them(
     square: Process,
 ) -> None:
@@ -250,6 +298,22 @@ def test_reservations_that_the_index_had_missed_are_planned_around_as_soon_as_th
     (entered,) = [enter for block, enter, _ in held(intent) if block == secret[0]]
     assert (intent.sequence, entered) == (2, secret[2])
     assert_sound(square)
+
+
+def test_who_was_being_written_when_the_writer_died_hears_that_nobody_knows(ledger: str, clock: FakeClock) -> None:
+    class PowerCut(BaseException):
+        pass
+
+    def render(_: Outcome) -> Never:
+        raise PowerCut
+
+    died = threading.Event()
+    with Process(ledger, SQUARE.airspace, clock, on_death=died.set) as process:
+        with pytest.raises(OutcomeUnknown, match="the ledger writer has died"):
+            process.submit(SQUARE.submission("N", "S"), IdempotencyKey("key", "digest", render))
+        assert died.wait(10)
+        with pytest.raises(LedgerUnavailable, match="has stopped"):
+            process.submit(SQUARE.submission("N", "S"))
 
 
 # A database that fails
@@ -272,6 +336,30 @@ def on_commit(handler: Callable[[Connection], object]) -> Iterator[None]:
         event.remove(Engine, "commit", listener)
 
 
+@contextmanager
+def on_next_commit(handler: Callable[[Connection], object]) -> Iterator[None]:
+    """Call a handler with the writing connection that commits next; commits after that are left alone."""
+    handlers = [handler]
+    with on_commit(lambda connection: handlers.pop()(connection) if handlers else None):
+        yield
+    assert not handlers
+
+
+@contextmanager
+def unwritable() -> Iterator[None]:
+    """Fail all transactions that write, from their beginning."""
+
+    def listener(connection: Connection) -> None:
+        if connection.engine.pool.size() == 1:  # type: ignore[attr-defined]
+            raise OperationalError("BEGIN", {}, sqlite3.OperationalError("unable to open database file"))
+
+    event.listen(Engine, "begin", listener)
+    try:
+        yield
+    finally:
+        event.remove(Engine, "begin", listener)
+
+
 def fail(connection: Connection) -> None:
     """Fail instead of committing."""
     del connection
@@ -286,7 +374,7 @@ def commit_and_fail(connection: Connection) -> None:
 
 def test_requests_whose_commit_failed_are_told_that_nothing_was_recorded(square: Process) -> None:
     square.submit(SQUARE.submission("N", "S"))
-    with on_commit(fail):
+    with on_next_commit(fail):
         answers = outcomes(square, *[SQUARE.submission("N", "S") for _ in range(3)])
     assert [type(answer) for answer in answers] == [LedgerUnavailable] * 3
     assert len(square.ledger.everything()[0]) == 1
@@ -294,7 +382,7 @@ def test_requests_whose_commit_failed_are_told_that_nothing_was_recorded(square:
 
 def test_after_a_commit_that_failed_the_service_goes_on_as_if_it_had_not_been_tried(square: Process) -> None:
     first = square.submit(SQUARE.submission("N", "S"))
-    with on_commit(fail), pytest.raises(LedgerUnavailable):
+    with on_next_commit(fail), pytest.raises(LedgerUnavailable):
         square.submit(SQUARE.submission("N", "S"))
     second = square.submit(SQUARE.submission("S", "N"))
     assert [first.sequence, second.sequence] == [1, 2]
@@ -312,24 +400,43 @@ def at_once(process: Process, *submissions: Submission) -> list[Outcome | BaseEx
 
 
 def test_while_the_ledger_fails_nobody_waits_for_it(square: Process) -> None:
-    with on_commit(fail):
-        with pytest.raises(LedgerUnavailable):
-            square.submit(SQUARE.submission("N", "S"))
-        asyncio.run(until(lambda: square.deconfliction.trouble is not None))
+    with unwritable():
         failed = at_once(square, *[SQUARE.submission("N", "S") for _ in range(100)])
     assert [type(answer) for answer in failed] == [LedgerUnavailable] * 100
-    assert "the commit failed: the connection was lost; nothing was recorded" in str(failed[-1])
+    assert "unable to open database file; nothing was recorded" in str(failed[-1])
     assert len(square.ledger.everything()[0]) == 0
 
 
 def test_the_writer_notices_by_itself_that_the_ledger_can_be_written_again(square: Process) -> None:
-    with on_commit(fail):
-        with pytest.raises(LedgerUnavailable):
-            square.submit(SQUARE.submission("N", "S"))
-        asyncio.run(until(lambda: square.deconfliction.trouble is not None))
+    with unwritable(), pytest.raises(LedgerUnavailable):
+        square.submit(SQUARE.submission("N", "S"))
+    assert square.deconfliction.trouble is not None
     asyncio.run(until(lambda: square.deconfliction.trouble is None))
     assert square.submit(SQUARE.submission("N", "S")).sequence == 1
     assert_sound(square)
+
+
+def test_a_commit_whose_fate_nobody_can_tell_is_answered_as_unknown(ledger: str, clock: FakeClock) -> None:
+    policy = replace(POLICY, look_up_ms=200)
+    with Process(ledger, SQUARE.airspace, clock, policy=policy) as process:
+        with on_commit(commit_and_fail), pytest.raises(OutcomeUnknown, match="repeat the request with the same"):
+            process.submit(SQUARE.submission("N", "S"))
+        # It was there after all.
+        assert process.submit(SQUARE.submission("N", "S")).sequence == 2
+        assert_sound(process)
+
+
+@on_sqlite
+def test_writing_what_changes_nothing_writes(ledger: str) -> None:
+    book = open_ledger(ledger, SQUARE.airspace, claim=True)
+    with database(ledger) as connection:
+        connection.execute("UPDATE airspace SET name = 'there is a log now'")
+        before = Path(f"{ledger}-wal").stat().st_size
+        with book.transaction() as transaction:
+            transaction.touch()
+        assert Path(f"{ledger}-wal").stat().st_size > before
+        assert connection.rows("SELECT sequence, revision FROM counters") == [(0, 0)]
+    book.close()
 
 
 @contextmanager
@@ -348,10 +455,10 @@ def broken_log() -> Iterator[None]:
 def test_a_log_that_cannot_be_written_stops_nothing_and_reserves_nothing_twice(street: Process) -> None:
     with broken_log():
         first = street.submit(STREET.submission("W", "E"))
-        with on_commit(fail), pytest.raises(LedgerUnavailable):
+        with on_next_commit(fail), pytest.raises(LedgerUnavailable):
             street.submit(STREET.submission("W", "E"))
         asyncio.run(until(lambda: street.deconfliction.trouble is None))
-        with on_commit(commit_and_fail):
+        with on_next_commit(commit_and_fail):
             second = street.submit(STREET.submission("W", "E"))
     assert (first.sequence, second.sequence) == (1, 2)
     assert_sound(street)
@@ -369,7 +476,7 @@ def test_a_request_that_fails_as_nobody_expected_holds_nothing(street: Process) 
 
 
 def test_requests_whose_commit_was_lost_after_it_happened_are_answered_from_the_ledger(street: Process) -> None:
-    with on_commit(commit_and_fail):
+    with on_next_commit(commit_and_fail):
         answers = outcomes(street, STREET.submission("W", "E", window_ms=0), STREET.submission("W", "E", window_ms=0))
     accepted, refused = (answer.intent for answer in answers if isinstance(answer, Outcome))
     assert (accepted.sequence, accepted.state, held(accepted)) == (1, State.ACCEPTED, set(reserved(street.location)))
@@ -379,7 +486,7 @@ def test_requests_whose_commit_was_lost_after_it_happened_are_answered_from_the_
 
 
 def test_after_a_commit_that_was_lost_the_service_goes_on_with_what_it_did(street: Process) -> None:
-    with on_commit(commit_and_fail):
+    with on_next_commit(commit_and_fail):
         street.submit(STREET.submission("W", "E"))
     second = street.submit(STREET.submission("W", "E"))
     assert second.sequence == 2
@@ -388,7 +495,7 @@ def test_after_a_commit_that_was_lost_the_service_goes_on_with_what_it_did(stree
 
 def test_a_cancellation_whose_commit_was_lost_is_answered_from_the_ledger(square: Process) -> None:
     intent = square.submit(SQUARE.submission("N", "S"))
-    with on_commit(commit_and_fail):
+    with on_next_commit(commit_and_fail):
         cancelled = square.cancel(intent)
     assert (cancelled.state, cancelled.version) == (State.CANCELLED, 2)
     assert_sound(square)
@@ -396,7 +503,7 @@ def test_a_cancellation_whose_commit_was_lost_is_answered_from_the_ledger(square
 
 def test_a_cancellation_whose_commit_failed_has_not_happened(square: Process) -> None:
     intent = square.submit(SQUARE.submission("N", "S"))
-    with on_commit(fail), pytest.raises(LedgerUnavailable):
+    with on_next_commit(fail), pytest.raises(LedgerUnavailable):
         square.cancel(intent)
     found = square.ledger.find(intent.id)
     assert found is not None
@@ -407,7 +514,7 @@ def test_a_cancellation_whose_commit_failed_has_not_happened(square: Process) ->
 
 def test_a_repetition_whose_commit_was_lost_is_answered_with_the_first_answer(square: Process) -> None:
     first = submit(square)
-    with on_commit(commit_and_fail):
+    with on_next_commit(commit_and_fail):
         again = submit(square)
     assert (again.intent.id, again.replayed) == (first.intent.id, b"1")
 
@@ -429,7 +536,7 @@ def cut(location: str, *, after_commit: bool) -> Callable[[Connection], None]:
 def test_requests_whose_connection_was_cut_before_the_commit_are_told_that_nothing_was_recorded(
     square: Process,
 ) -> None:
-    with on_commit(cut(square.location, after_commit=False)):
+    with on_next_commit(cut(square.location, after_commit=False)):
         answers = outcomes(square, *[SQUARE.submission("N", "S") for _ in range(3)])
     assert [type(answer) for answer in answers] == [LedgerUnavailable] * 3
     assert square.submit(SQUARE.submission("N", "S")).sequence == 1
@@ -438,7 +545,7 @@ def test_requests_whose_connection_was_cut_before_the_commit_are_told_that_nothi
 
 @on_postgresql
 def test_a_request_whose_connection_was_cut_after_the_commit_is_answered_from_the_ledger(square: Process) -> None:
-    with on_commit(cut(square.location, after_commit=True)):
+    with on_next_commit(cut(square.location, after_commit=True)):
         first = square.submit(SQUARE.submission("N", "S"))
     assert (first.sequence, held(first)) == (1, set(reserved(square.location)))
     assert square.submit(SQUARE.submission("S", "N")).sequence == 2
@@ -699,10 +806,12 @@ def test_a_key_is_kept_for_exactly_its_time(square: Process, clock: FakeClock) -
     assert submit(square, window_ms=THREE_DAYS_MS).intent.sequence == 4
 
 
-def test_a_key_outlives_a_clock_that_is_wrong_for_a_while(square: Process, clock: FakeClock) -> None:
-    submit(square, window_ms=THREE_DAYS_MS)
-    clock.advance(ms=2 * DAY_MS)
-    assert submit(square, window_ms=THREE_DAYS_MS).replayed == b"1"
+def test_a_key_outlives_a_clock_that_is_wrong_for_a_while(ledger: str, clock: FakeClock) -> None:
+    with Process(ledger, SQUARE.airspace, clock, elapsed_ms=FakeClock(0)) as process:
+        submit(process, window_ms=THREE_DAYS_MS)
+        clock.advance(ms=2 * DAY_MS)
+        process.submit(SQUARE.submission("N", "S", earliest_ms=clock.now_ms))
+        assert submit(process, window_ms=THREE_DAYS_MS).replayed == b"1"
 
 
 def test_a_key_of_a_request_that_was_not_recorded_can_be_used_again(square: Process, clock: FakeClock) -> None:

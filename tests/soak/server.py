@@ -16,9 +16,15 @@ def main() -> None:
     """Serve the shipped airspace from `folder` on `port`, `rate` seconds a second."""
     folder, port, rate = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
     began, start_ms = time.monotonic(), now_ms()
-    settings = Settings(ledger=str(folder / "soak.sqlite"), retention_days=1 / 24, log_level="warning")
+
+    def fast_clock() -> int:
+        return start_ms + int((time.monotonic() - began) * rate * 1000)
+
+    settings = Settings(
+        ledger=str(folder / "soak.sqlite"), retention_days=1 / 24, idempotency_hours=1, log_level="warning"
+    )
     logs.configure(settings)
-    app = create_app(settings, lambda: start_ms + int((time.monotonic() - began) * rate * 1000))
+    app = create_app(settings, fast_clock, elapsed_ms=fast_clock)
     uvicorn.run(app, port=port, log_config=None, access_log=False)
 
 
