@@ -54,6 +54,8 @@ _RETRY_S = 0.1
 _CALM_S = 2.0
 # Without requests the writer wakes up this often; while there is something to remove, this often.
 _IDLE_S, _PAUSE_S = 1.0, 0.01
+# How often the ledger may do what spares the writer work.
+_CHECKPOINT_S = 1.0
 # How often retention looks for what has passed; and how much it removes at once, so that nobody waits long for it.
 _HOUSE_MS = 60_000
 _REMOVE_INTENTS, _REMOVE_ENTRIES, _REMOVE_ANSWERS = 32, 256, 64
@@ -176,6 +178,8 @@ class Deconfliction:
         self._on_death = on_death
         self._queue: queue.Queue[Request | None] = queue.Queue(policy.queue_limit)
         self._thread = threading.Thread(target=self._work, name="ledger-writer", daemon=True)
+        self._ended = threading.Event()
+        self._helper = threading.Thread(target=self._checkpoint, name="ledger-checkpoints", daemon=True)
         self._revision: int | None = None
         self._watermark_ms = 0
         self._forgotten_ms = 0
@@ -198,12 +202,14 @@ class Deconfliction:
         self._kept_house_ms = now
         self._known_ms = (now if newest_ms is None else min(now, newest_ms)) - self._elapsed_ms()
         self._thread.start()
+        self._helper.start()
 
     def stop(self) -> None:
         """Finish what is in the queue, then end the writer."""
         if self._thread.is_alive():
             self._queue.put(None)
             self._thread.join()
+            self._helper.join()
 
     @property
     def is_running(self) -> bool:
@@ -325,6 +331,7 @@ class Deconfliction:
                 log.critical("the ledger writer has died", exc_info=error)
         finally:
             # Whoever still got into the queue hears of it; nobody gets in any more.
+            self._ended.set()
             with self._open:
                 self._closed = True
             while not self._queue.empty():
@@ -335,6 +342,10 @@ class Deconfliction:
                     )
             if not self._stopping:
                 self._on_death()
+
+    def _checkpoint(self) -> None:
+        while not self._ended.wait(_CHECKPOINT_S):
+            self._ledger.checkpoint()
 
     def _serve(self) -> None:
         while not self._stopping:

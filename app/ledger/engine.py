@@ -4,48 +4,22 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import files
-from typing import Protocol
 
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, insert, select
+from sqlalchemy import Connection, insert, select
 from sqlalchemy.exc import DatabaseError
 
 from app.errors import AirspaceMismatch, LedgerOutdated, StartupError
 from app.ledger import tables
+from app.ledger.database import Database
 from app.ledger.ledger import Ledger, cause_of, touch
 from app.ledger.location import Location, parse_location
 from app.ledger.postgresql import PostgresqlDatabase
-from app.ledger.rows import HeldReservations
 from app.ledger.sqlite import SqliteDatabase
 from planner.airspace import Airspace
-
-
-class Database(Protocol):
-    """What differs between the databases that a ledger can be in."""
-
-    location: Location
-
-    @property
-    def name(self) -> str:
-        """The database's kind."""
-
-    def create(self) -> None:
-        """Make a place for a ledger where there is none."""
-
-    def check(self) -> None:
-        """Raise `LedgerMissing` or `ForeignLedger` where that shows without a connection."""
-
-    def check_tables(self, connection: Connection, *, may_be_empty: bool) -> None:
-        """Raise `LedgerMissing` or `ForeignLedger` where only a connection shows that."""
-
-    def engine(self, *, writes: bool, migrates: bool = False) -> Engine:
-        """Return an engine whose transactions hold the write lock from the start, or cannot write at all."""
-
-    def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
-        """Insert reservations; the database refuses an overlap."""
 
 
 def create_or_upgrade(location: str) -> str:
@@ -102,7 +76,7 @@ def open_ledger(location: str, airspace: Airspace, *, claim: bool = False) -> Le
         if claim:
             # A lock can be had on what cannot be written; now is the time to notice.
             touch(connection)
-    return Ledger(database.engine(writes=True), database.engine(writes=False), database.insert_reservations, airspace)
+    return Ledger(database, airspace)
 
 
 def kind_of(location: str) -> str:

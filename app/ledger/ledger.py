@@ -13,12 +13,13 @@ from itertools import takewhile
 from typing import Any
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, Engine, and_, case, delete, func, insert, select, tuple_, update
+from sqlalchemy import ColumnElement, Connection, and_, case, delete, func, insert, select, tuple_, update
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
+from app.ledger.database import Database
 from app.ledger.rows import HeldReservations, by_intent, columns_of, dump_columns, joined, to_held, to_intent, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from planner.airmatrix import IntArray
@@ -75,18 +76,20 @@ class Removed:
 class Ledger:
     """One ledger: `transaction()` to write, everything else to read."""
 
-    def __init__(
-        self, writer: Engine, reader: Engine, insert_reservations: InsertReservations, airspace: Airspace
-    ) -> None:
-        self._writer = writer
-        self._reader = reader
-        self._insert_reservations = insert_reservations
+    def __init__(self, database: Database, airspace: Airspace) -> None:
+        self._writer = database.engine(writes=True)
+        self._reader = database.engine(writes=False)
+        self._database = database
         self._airspace = airspace
 
     def close(self) -> None:
         """Release all connections."""
         self._writer.dispose()
         self._reader.dispose()
+
+    def checkpoint(self) -> None:
+        """Spare the writer some work that can be done beside it; call it every second or so, in a thread of its own."""
+        self._database.checkpoint()
 
     @contextmanager
     def transaction(self) -> Iterator["Transaction"]:
@@ -108,7 +111,7 @@ class Ledger:
         try:
             try:
                 connection.begin()
-                transaction = Transaction(connection, self._airspace, self._insert_reservations)
+                transaction = Transaction(connection, self._airspace, self._database.insert_reservations)
                 yield transaction
                 transaction.flush()
             except DataError as error:

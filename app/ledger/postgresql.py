@@ -108,6 +108,9 @@ class PostgresqlDatabase:
 
         return engine
 
+    def checkpoint(self) -> None:
+        """Do nothing: the server sees to it."""
+
     def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
         """Insert reservations in one statement."""
         columns = [column.tolist() for column in (held.block, held.enter_ms, held.exit_ms, held.sequence)]

@@ -3,7 +3,7 @@
 import os
 import sqlite3
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +23,11 @@ _POLL_S = 0.001
 # As many as there are threads for plain `def` routes: none waits for a connection while another holds its thread.
 _READERS = 40
 # A flight's reservations lie all over the table, each on a page of its own. So pages are small (bytes; new ledgers
-# only), stay in memory (KiB), and are copied from the log to the file only now and then (pages).
+# only) and stay in memory (KiB). `checkpoint` copies them from the log to the file; the writer itself finishes that,
+# and begins the log anew, only when it has grown this long (pages).
 _PAGE_BYTES = 2048
 _WRITER_CACHE_KIB = 64 * 1024
-_CHECKPOINT_PAGES = 20_000
+_LOG_PAGES = 50_000
 
 
 class SqliteDatabase:
@@ -79,7 +80,7 @@ class SqliteDatabase:
             connection.execute(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
             if writes:
                 connection.execute(f"PRAGMA cache_size = -{_WRITER_CACHE_KIB}")
-                connection.execute(f"PRAGMA wal_autocheckpoint = {_CHECKPOINT_PAGES}")
+                connection.execute(f"PRAGMA wal_autocheckpoint = {_LOG_PAGES}")
                 # From here on `_begin_immediate` waits instead.
                 connection.execute("PRAGMA busy_timeout = 0")
 
@@ -91,6 +92,12 @@ class SqliteDatabase:
                 connection.exec_driver_sql("BEGIN")
 
         return engine
+
+    def checkpoint(self) -> None:
+        """Copy pages from the log to the file, as far as that is possible without anybody's waiting."""
+        with suppress(sqlite3.Error), closing(sqlite3.connect(self._path, isolation_level=None)) as connection:
+            connection.execute("PRAGMA synchronous = FULL")
+            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
 
     def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
         """Insert reservations, by driver: a hundred rows an intent are the hot path."""
