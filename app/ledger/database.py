@@ -29,6 +29,9 @@ class Database(Protocol):
     def engine(self, *, writes: bool, migrates: bool = False) -> Engine:
         """Return an engine whose transactions hold the write lock from the start, or cannot write at all."""
 
+    def is_undone_by(self, error: Exception) -> bool:
+        """Tell whether a COMMIT that failed like this has surely not happened."""
+
     def checkpoint(self) -> None:
         """Spare the writer some work that can be done beside it."""
 

@@ -132,6 +132,8 @@ class Ledger:
                 transaction.commit_s = time.perf_counter() - began
             except Exception as error:
                 connection.invalidate()
+                if self._database.is_undone_by(error):
+                    raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
                 raise CommitUncertain(f"the commit failed: {cause_of(error)}") from error
         finally:
             # From the commit on, nothing that fails may look as if nothing had been written.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import Connection, Engine, create_engine, event
 
-from app.errors import ForeignLedger, LedgerMissing, StartupError
+from app.errors import ForeignLedger, LedgerMissing, LedgerUnavailable, StartupError
 from app.ledger.location import Location
 from app.ledger.rows import HeldReservations
 
@@ -38,6 +38,7 @@ class SqliteDatabase:
     def __init__(self, location: Location) -> None:
         self.location = location
         self._path = location.path
+        self._file: tuple[int, int] | None = None
 
     def create(self) -> None:
         """Make a ledger, as yet without tables, of an absent or empty file.
@@ -73,6 +74,10 @@ class SqliteDatabase:
             connect_args={"timeout": _WAIT_S, "check_same_thread": False, "isolation_level": None},
         )
 
+        @event.listens_for(engine, "do_connect")
+        def look_first(*_: object) -> None:
+            self._check_is_same()
+
         @event.listens_for(engine, "connect")
         def configure(connection: sqlite3.Connection, _record: object) -> None:
             connection.execute("PRAGMA synchronous = FULL")
@@ -86,12 +91,30 @@ class SqliteDatabase:
 
         @event.listens_for(engine, "begin")
         def begin(connection: Connection) -> None:
+            self._check_is_same()
             if writes:
                 _begin_immediate(connection)
             else:
                 connection.exec_driver_sql("BEGIN")
 
         return engine
+
+    def _check_is_same(self) -> None:
+        """Raise `LedgerUnavailable` if another file stands where this one stood, or none: SQLite would not notice, and
+        what it wrote would be gone with the process.
+        """
+        try:
+            found = self._path.stat()
+        except OSError as error:
+            raise LedgerUnavailable(f"the ledger {self._path} is gone: {error.strerror}") from error
+        if self._file not in (None, (found.st_dev, found.st_ino)):
+            raise LedgerUnavailable(f"the ledger {self._path} was moved or replaced; restart the service")
+        self._file = (found.st_dev, found.st_ino)
+
+    def is_undone_by(self, error: Exception) -> bool:
+        """Tell whether a COMMIT failed on a full disk: then its last frame, which makes it one, was not written."""
+        cause = getattr(error, "orig", None)
+        return isinstance(cause, sqlite3.Error) and cause.sqlite_errorcode & 0xFF == sqlite3.SQLITE_FULL
 
     def checkpoint(self) -> None:
         """Copy pages from the log to the file, as far as that is possible without anybody's waiting."""

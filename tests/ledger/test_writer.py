@@ -597,6 +597,38 @@ def test_a_full_disk_fails_the_whole_batch_and_leaves_nothing_of_it(square: Proc
     assert_sound(square)
 
 
+@on_sqlite
+def test_a_commit_that_fails_on_a_full_disk_has_surely_not_happened(square: Process) -> None:
+    def disk_is_full(_: Connection) -> Never:
+        error = sqlite3.OperationalError("database or disk is full")
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+        raise OperationalError("COMMIT", {}, error)
+
+    with on_commit(disk_is_full):
+        answers = at_once(square, *[SQUARE.submission("N", "S") for _ in range(3)])
+    assert [type(answer) for answer in answers] == [LedgerUnavailable] * 3
+    assert square.submit(SQUARE.submission("N", "S")).sequence == 1
+
+
+@on_sqlite
+@pytest.mark.parametrize("replaced", [False, True], ids=["moved away", "replaced"])
+def test_a_ledger_that_was_moved_is_noticed_before_anything_is_accepted(replaced: bool, square: Process) -> None:
+    first = square.submit(SQUARE.submission("N", "S"))
+    path = Path(square.location)
+    path.rename(path.with_suffix(".moved"))
+    if replaced:
+        path.write_bytes(path.with_suffix(".moved").read_bytes())
+    with pytest.raises(LedgerUnavailable, match="was moved or replaced" if replaced else "is gone"):
+        square.submit(SQUARE.submission("N", "S"))
+    with pytest.raises(LedgerUnavailable):
+        square.ledger.find(first.id)
+    assert path.exists() is replaced
+    path.with_suffix(".moved").rename(path)
+    asyncio.run(until(lambda: square.deconfliction.trouble is None))
+    assert square.submit(SQUARE.submission("N", "S")).sequence == 2
+    assert_sound(square)
+
+
 def test_an_unexpected_error_in_one_request_harms_neither_its_neighbours_nor_the_writer(square: Process) -> None:
     class Surprise(Exception):
         pass
