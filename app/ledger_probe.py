@@ -25,8 +25,9 @@ class LedgerProbe:
     async def revision(self) -> int:
         """Return the ledger's newest revision; `LedgerUnavailable` if it cannot be read, or not in time."""
         if self._asked is None or self._asked.done():
-            self._asked = Future()
-            Thread(target=self._ask, args=(self._asked,), name="ledger-probe", daemon=True).start()
+            asked: Future[int] = Future()
+            Thread(target=self._ask, args=(asked,), name="ledger-probe", daemon=True).start()
+            self._asked = asked
         try:
             # Shielded: who asks next waits for the same answer.
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(self._asked)), self._patience_s)

@@ -105,7 +105,12 @@ class Workers:
     def _listen(self, caught: int) -> None:
         """Wait until a worker says something or dies, or a signal comes, or some time has passed."""
         sources = [source for worker in self._workers for source in (worker.pulse, worker.process.sentinel)]
+        began = time.monotonic()
         multiprocessing.connection.wait([*sources, caught], timeout=_PULSE_S / 2)
+        if time.monotonic() - began > 2 * _PULSE_S:
+            # This process stood still itself, as after Ctrl-Z, and perhaps all did: nobody is known to be silent.
+            for worker in self._workers:
+                worker.heard = time.monotonic()
         for worker in self._workers:
             # The pipe of a dead worker ends.
             with suppress(EOFError):

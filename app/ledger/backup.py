@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from psycopg.conninfo import make_conninfo
 
@@ -40,21 +39,24 @@ def back_up(
     check_exists(location)
     place = parse_location(location)
     _check_free(out, place, replace)
+    # A folder beside the file, for a copy that is under way has files beside itself.
+    folder = out.with_name(f".{out.name}.{os.getpid()}")
+    copy = folder / "copy"
     try:
-        # In a folder beside the file, for a copy that is under way has files beside itself.
-        with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-            copy = Path(folder, "copy")
-            if place.is_sqlite:
-                _copy_sqlite(place.path, copy, advance)
-            else:
-                _dump_postgresql(place, copy)
-            _sync(copy)
-            size = copy.stat().st_size
-            _check_free(out, place, replace)
-            copy.replace(out)
-            _sync(out.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        if place.is_sqlite:
+            _copy_sqlite(place.path, copy, advance)
+        else:
+            _dump_postgresql(place, copy)
+        _sync(copy)
+        size = copy.stat().st_size
+        _check_free(out, place, replace)
+        copy.replace(out)
+        _sync(out.parent)
     except OSError as error:
         raise StartupError(f"cannot write {out}: {error.strerror}") from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
     return size
 
 
@@ -73,7 +75,7 @@ def _check_free(out: Path, place: Location, replace: bool) -> None:
 
 def _copy_sqlite(path: Path, copy: Path, advance: Callable[[float], None]) -> None:
     def copied(_status: int, remaining: int, total: int) -> None:
-        advance(1.0 - remaining / total)
+        advance(1.0 - remaining / max(total, 1))
 
     try:
         with (

@@ -35,5 +35,8 @@ class Database(Protocol):
     def checkpoint(self) -> None:
         """Spare the writer some work that can be done beside it."""
 
+    def close(self) -> None:
+        """Release what `checkpoint` holds; not while it runs."""
+
     def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
         """Insert reservations; the database refuses an overlap."""

@@ -84,6 +84,7 @@ class Ledger:
 
     def close(self) -> None:
         """Release all connections."""
+        self._database.close()
         self._writer.dispose()
         self._reader.dispose()
 

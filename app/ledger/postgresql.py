@@ -116,6 +116,9 @@ class PostgresqlDatabase:
     def checkpoint(self) -> None:
         """Do nothing: the server sees to it."""
 
+    def close(self) -> None:
+        """Do nothing: there is nothing that `checkpoint` holds."""
+
     def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
         """Insert reservations in one statement."""
         columns = [column.tolist() for column in (held.block, held.enter_ms, held.exit_ms, held.sequence)]

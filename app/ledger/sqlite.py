@@ -39,6 +39,7 @@ class SqliteDatabase:
         self.location = location
         self._path = location.path
         self._file: tuple[int, int] | None = None
+        self._checkpoints: sqlite3.Connection | None = None
 
     def create(self) -> None:
         """Make a ledger, as yet without tables, of an absent or empty file.
@@ -50,9 +51,16 @@ class SqliteDatabase:
         path = self._path
         if not path.parent.is_dir():
             raise LedgerMissing(f"cannot create ledger {path}: there is no folder {path.parent}")
-        if path.exists() and not os.access(path, os.W_OK):
+        absent = not path.exists() or path.stat().st_size == 0
+        log = path.with_name(f"{path.name}-wal")
+        if absent and log.exists() and log.stat().st_size > 0:
+            # SQLite would delete it.
+            raise ForeignLedger(
+                f"{log} belongs to a ledger that is gone from {path}; put it back, or move this file too"
+            )
+        if not absent and not os.access(path, os.W_OK):
             raise StartupError(f"cannot write ledger {path}: no permission; --read-only serves it to readers")
-        if not path.exists() or path.stat().st_size == 0 or _check_is_ledger(path)[_WRITE_VERSION] != _WAL:
+        if absent or _check_is_ledger(path)[_WRITE_VERSION] != _WAL:
             _mark(path)
 
     def check(self) -> None:
@@ -108,7 +116,7 @@ class SqliteDatabase:
         except OSError as error:
             raise LedgerUnavailable(f"the ledger {self._path} is gone: {error.strerror}") from error
         if self._file not in (None, (found.st_dev, found.st_ino)):
-            raise LedgerUnavailable(f"the ledger {self._path} was moved or replaced; restart the service")
+            raise LedgerUnavailable(f"the ledger {self._path} was moved or replaced; put it back, and then restart")
         self._file = (found.st_dev, found.st_ino)
 
     def is_undone_by(self, error: Exception) -> bool:
@@ -117,10 +125,23 @@ class SqliteDatabase:
         return isinstance(cause, sqlite3.Error) and cause.sqlite_errorcode & 0xFF == sqlite3.SQLITE_FULL
 
     def checkpoint(self) -> None:
-        """Copy pages from the log to the file, as far as that is possible without anybody's waiting."""
-        with suppress(sqlite3.Error), closing(sqlite3.connect(self._path, isolation_level=None)) as connection:
-            connection.execute("PRAGMA synchronous = FULL")
-            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+        """Copy pages from the log to the file, as far as that is possible without anybody's waiting.
+
+        On one connection, which stays with its file: a new one to a name whose file was moved would make another file,
+        and delete the log that stands beside it.
+        """
+        with suppress(sqlite3.Error, LedgerUnavailable):
+            self._check_is_same()
+            if self._checkpoints is None:
+                location = f"{self._path.absolute().as_uri()}?mode=rw"
+                self._checkpoints = sqlite3.connect(location, uri=True, isolation_level=None, check_same_thread=False)
+                self._checkpoints.execute("PRAGMA synchronous = FULL")
+            self._checkpoints.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+
+    def close(self) -> None:
+        """Release what `checkpoint` holds; not while it runs."""
+        if self._checkpoints is not None:
+            self._checkpoints.close()
 
     def insert_reservations(self, connection: Connection, held: HeldReservations) -> None:
         """Insert reservations, by driver: a hundred rows an intent are the hot path."""

@@ -69,7 +69,7 @@ def unreadable(client: Client) -> Iterator[Client]:
     "path",
     [
         SUBMIT,
-        f"{SUBMIT}/0193",
+        f"{SUBMIT}/01a2025d-cf8d-7793-bfd6-fd7be76cdfea",
         "/v1/events",
         "/v1/airspace/status",
         "/v1/airspace/occupancy",

@@ -22,8 +22,8 @@ _SEED = 8
 _CLIENTS = 8
 _FLIGHTS = 20
 _RESERVATIONS = 20_000
-_LOAD_S = 0.5
-_CUTTING_S = 1.5
+_LOAD_S = 0.4
+_CUTTING_S = 1.2
 _CUT_OF_COMMITS = 0.3
 _CUT_EVERY_S = 0.05
 # Longer than the service looks for what became of a commit.

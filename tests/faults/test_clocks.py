@@ -8,6 +8,6 @@ from tests.ledger.locations import Ledgers
 
 @pytest.mark.compiled
 def test_clocks_may_be_set_forward_and_back(ledgers: Ledgers) -> None:
-    verdict = clock_steps(ledgers, 5, lambda _: None)
+    verdict = clock_steps(ledgers, 4, lambda _: None)
     assert verdict.wrong == []
     assert len(verdict.told.accepted) > 100

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.databases import commits_cut, connections_cut, crashes
+from tests.faults.databases import commits_cut, crashes
 from tests.postgres import Cluster, NoPostgres, cluster
 
 pytestmark = [pytest.mark.compiled, pytest.mark.postgres]
@@ -26,12 +26,6 @@ def durable_postgres() -> Iterator[Cluster]:
 
 def test_a_database_that_crashes_under_load_is_waited_for(tmp_path: Path, durable_postgres: Cluster) -> None:
     verdict = crashes(tmp_path, 1, lambda _: None, durable_postgres)
-    assert verdict.wrong == []
-    assert (len(verdict.back_s), verdict.verifications) == (1, 1)
-
-
-def test_connections_that_the_database_ends_are_made_again(tmp_path: Path, durable_postgres: Cluster) -> None:
-    verdict = connections_cut(tmp_path, 1, lambda _: None, durable_postgres)
     assert verdict.wrong == []
     assert (len(verdict.back_s), verdict.verifications) == (1, 1)
 

@@ -8,6 +8,6 @@ from tests.ledger.locations import Ledgers
 
 @pytest.mark.compiled
 def test_a_part_of_the_writer_that_raises_loses_nothing(ledgers: Ledgers) -> None:
-    verdict = raising(ledgers, 30, lambda _: None)
+    verdict = raising(ledgers, 20, lambda _: None)
     assert verdict.wrong == []
     assert len(verdict.told.unrecorded) > 0

@@ -110,3 +110,28 @@ def test_a_copied_file_is_a_ledger(tmp_path: Path) -> None:
     ledger.close()
     assert found is not None
     assert found.sequence == 1
+
+
+def test_a_new_ledger_is_not_made_beside_the_log_of_one_that_is_gone(tmp_path: Path) -> None:
+    path = tmp_path / "ledger.sqlite"
+    log = tmp_path / "ledger.sqlite-wal"
+    log.write_bytes(b"what somebody committed")
+    with pytest.raises(ForeignLedger, match="belongs to a ledger that is gone"):
+        create_or_upgrade(str(path))
+    assert not path.exists()
+    assert log.read_bytes() == b"what somebody committed"
+
+
+def test_checkpoints_leave_the_log_of_a_ledger_that_was_moved_away(tmp_path: Path) -> None:
+    path = tmp_path / "ledger.sqlite"
+    path.write_bytes(migrated_file())
+    ledger = open_ledger(str(path), AIRSPACE, claim=True)
+    ledger.checkpoint()
+    with ledger.transaction() as transaction:
+        transaction.touch()
+    path.rename(tmp_path / "away.sqlite")
+    ledger.checkpoint()
+    assert not path.exists()
+    assert (tmp_path / "ledger.sqlite-wal").stat().st_size > 0
+    (tmp_path / "away.sqlite").rename(path)
+    ledger.close()
