@@ -209,6 +209,7 @@ class Deconfliction:
         if self._thread.is_alive():
             self._queue.put(None)
             self._thread.join()
+        if self._helper.is_alive():
             self._helper.join()
 
     @property

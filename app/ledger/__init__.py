@@ -1,6 +1,6 @@
 """The ledger: the durable truth about flight intents and reservations. The only user of SQLAlchemy."""
 
-from app.ledger.engine import check_exists, create_or_upgrade, kind_of, open_ledger
+from app.ledger.engine import check_exists, create_or_upgrade, open_ledger
 from app.ledger.ledger import IdempotencyRecord, JournalEntry, Ledger, Transaction
 from app.ledger.location import Location, parse_location
 
@@ -12,7 +12,6 @@ __all__ = [
     "Transaction",
     "check_exists",
     "create_or_upgrade",
-    "kind_of",
     "open_ledger",
     "parse_location",
 ]

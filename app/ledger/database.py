@@ -13,10 +13,6 @@ class Database(Protocol):
 
     location: Location
 
-    @property
-    def name(self) -> str:
-        """The database's kind."""
-
     def create(self) -> None:
         """Make a place for a ledger where there is none."""
 

@@ -79,11 +79,6 @@ def open_ledger(location: str, airspace: Airspace, *, claim: bool = False) -> Le
     return Ledger(database, airspace)
 
 
-def kind_of(location: str) -> str:
-    """Return which database a ledger is in: `sqlite` or `postgresql`."""
-    return _database_at(location).name
-
-
 def _database_at(location: str) -> Database:
     place = parse_location(location)
     return SqliteDatabase(place) if place.is_sqlite else PostgresqlDatabase(place)

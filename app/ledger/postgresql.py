@@ -31,8 +31,6 @@ _READ = "30s"
 class PostgresqlDatabase:
     """One PostgreSQL database (or one schema, where the URL's options set `search_path`)."""
 
-    name = "postgresql"
-
     def __init__(self, location: Location) -> None:
         self.location = location
 

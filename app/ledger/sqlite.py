@@ -33,8 +33,6 @@ _LOG_PAGES = 50_000
 class SqliteDatabase:
     """One SQLite file in WAL mode: readers never wait for the writer, nor the writer for them."""
 
-    name = "sqlite"
-
     def __init__(self, location: Location) -> None:
         self.location = location
         self._path = location.path

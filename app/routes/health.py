@@ -69,7 +69,7 @@ async def ready(service: ServiceDep) -> Readiness:
         reasons.append(str(error))
     waiting = 0 if writer is None else writer.waiting
     if revision is None or reasons:
-        raise NotReady("; ".join(reasons), waiting, revision)
+        raise NotReady("; ".join(dict.fromkeys(reasons)), waiting, revision)
     return Readiness(mode=_mode(service), revision=revision, waiting=waiting)
 
 
