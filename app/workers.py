@@ -9,6 +9,7 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 
 import structlog
 
@@ -92,6 +94,7 @@ class Workers:
 
     def _start_due(self) -> None:
         now = time.monotonic()
+        _let_go_of_a_broken_stderr()
         starting, self._due = [due for due in self._due if due <= now], [due for due in self._due if due > now]
         for _ in starting:
             try:
@@ -205,6 +208,14 @@ def _signal_in(caught: int) -> signal.Signals | None:
         return signal.Signals(os.read(caught, 1)[0])
     except BlockingIOError:
         return None
+
+
+def _let_go_of_a_broken_stderr() -> None:
+    """If nobody reads the log any more, write it nowhere: starting a process flushes stderr, and would fail."""
+    try:
+        sys.stderr.flush()
+    except (OSError, ValueError):
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
 
 
 def _run(work: Work, pulse: Connection) -> None:
