@@ -245,6 +245,8 @@ class Deconfliction:
         ------
         DepartureInThePast, BeyondHorizon, IdempotencyKeyReused, QueueFull, LedgerUnavailable
             Nothing was recorded.
+        OutcomeUnknown
+            The commit was lost, and the ledger cannot be asked.
         """
         intent_id = str(uuid7())
 
@@ -563,9 +565,11 @@ class Deconfliction:
     def _keep_up(self) -> None:
         """Bring the index up to the ledger's newest revision, so that it is not far behind when a request comes."""
         if self._revision is not None and self._ledger.revision() != self._revision:
+            # First, for it may find that the index has to be loaded afresh.
+            now = self._now()
             revision, self._revision = self._revision, None
             with self._ledger.transaction() as transaction:
-                self._catch_up(transaction, self._now(), revision)
+                self._catch_up(transaction, now, revision)
             self._revision = transaction.revision
 
     def _remove_passed(self) -> int:

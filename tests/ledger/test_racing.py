@@ -19,6 +19,7 @@ from tests.ledger.process import (
     assert_journal_tells_states,
     assert_no_overlaps,
     reserved,
+    until,
 )
 from tests.ledger.test_restart import described, random_submission
 
@@ -175,3 +176,14 @@ def test_processes_with_different_clocks_never_overlap(ledger: str) -> None:
             late.advance(seconds=11)
     assert_no_overlaps(ledger)
     assert_gapless(ledger)
+
+
+def test_an_idle_process_whose_clock_was_set_back_has_its_whole_index_again(ledger: str) -> None:
+    wrong, right = FakeClock(), FakeClock()
+    with Process(ledger, STREET.airspace, wrong) as one, Process(ledger, STREET.airspace, right) as other:
+        one.submit(STREET.submission("W", "E"))
+        wrong.advance(seconds=86_400)
+        one.submit(STREET.submission("W", "E", earliest_ms=wrong.now_ms))
+        wrong.advance(seconds=-86_400)
+        other.submit(STREET.submission("W", "E", earliest_ms=START_MS + 600_000))
+        asyncio.run(until(lambda: one.indexed(START_MS) == reserved(ledger, START_MS)))
