@@ -15,7 +15,7 @@ from typing import Annotated
 
 import typer
 
-from app.commands.terminal import progress_bar, remark, write
+from app.commands.terminal import interrupt_held, progress_bar, remark, write
 from app.errors import StartupError
 from app.service import load_airspace
 from app.settings import Settings
@@ -44,10 +44,15 @@ def paper(
     field = load_airspace(Settings.given(airspace=airspace))
     try:
         with _staging(out) as folder:
-            if not kernels_are_compiled():
-                remark("note", "cyan", "compiling the planner's kernels, once per version; this takes some ten seconds")
-            warm_up()
-            with progress_bar("flights", design.workload(field)) as advance_to:
+            with interrupt_held() as check_interrupt, progress_bar("flights", design.workload(field)) as show_done:
+                if not kernels_are_compiled():
+                    remark("note", "cyan", "compiling the kernels, once per version; this takes some ten seconds")
+                warm_up()
+
+                def advance_to(done: float, aside: str = "") -> None:
+                    check_interrupt()
+                    show_done(done, aside)
+
                 study = conduct(field, design, advance_to)
             # The figures need matplotlib, which no other command waits for.
             from planner.experiments.report import Provenance, build_report

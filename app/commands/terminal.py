@@ -1,8 +1,10 @@
 """What commands show: results on stdout, everything else on stderr, all text as it is."""
 
-from collections.abc import Iterator, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Protocol
 
 import numpy as np
@@ -41,6 +43,33 @@ def progress_bar(what: str, total: float) -> Iterator[Advance]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(what, total=total, aside="")
         yield lambda done, aside="": progress.update(task, completed=done, aside=aside)
+
+
+@contextmanager
+def interrupt_held() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back while the block runs; what it yields raises the `KeyboardInterrupt` where that is safe.
+
+    Kernels build named tuples, in Python: an exception raised there ends the process with a segmentation fault, or
+    is lost (numba issue 2324). A second Ctrl-C raises at once.
+    """
+    received = False
+    before = signal.getsignal(signal.SIGINT)
+
+    def receive(_number: int, _frame: FrameType | None) -> None:
+        nonlocal received
+        received = True
+        signal.signal(signal.SIGINT, before)
+
+    def check() -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, receive)
+    try:
+        yield check
+        check()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def spread(values_ms: Sequence[float] | NDArray[np.float64]) -> str:

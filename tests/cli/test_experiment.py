@@ -154,11 +154,15 @@ def test_an_interrupted_run_leaves_nothing(town_file: Path, tmp_path: Path) -> N
         "--flights",
         "3000",
     ]
-    process = subprocess.Popen(arguments, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while process.poll() is None and not list(out.glob(".report-*")):
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    printed, err = process.communicate(timeout=30)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(arguments, env=environment(), text=True, **pipes) as process:
+        try:
+            while process.poll() is None and not list(out.glob(".report-*")):
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            printed, err = process.communicate(timeout=30)
+        finally:
+            process.kill()
     assert (process.returncode, printed) == (130, "")
     assert "interrupted: nothing was written" in err
     assert "Traceback" not in err
