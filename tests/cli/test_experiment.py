@@ -154,8 +154,9 @@ def test_an_interrupted_run_leaves_nothing(town_file: Path, tmp_path: Path) -> N
         "--flights",
         "3000",
     ]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(arguments, env=environment(), text=True, **pipes) as process:
+    with subprocess.Popen(
+        arguments, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             while process.poll() is None and not list(out.glob(".report-*")):
                 time.sleep(0.05)
