@@ -18,9 +18,10 @@ from prometheus_client import (
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
 from app import problems
-from app.deconfliction import BATCH_REQUESTS, BatchReport, Outcome, PreviewPlan
+from app.deconfliction import Outcome, PreviewPlan
 from app.flight_intents import FlightIntent, Refusal
-from app.ledger.ledger import CommitUncertain
+from app.ledger import CommitUncertain
+from app.writer import BATCH_REQUESTS, BatchReport
 from planner.errors import NoPlan, NotPlannable
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -83,7 +84,9 @@ class Metrics:
         self._batch_size = Histogram(
             "airmatrix_batch_requests", "Requests of a batch.", buckets=_SIZES, registry=registry
         )
-        self._queue_seconds = _seconds("queue", "From a request's arrival until its planning began.", registry)
+        self._queue_seconds = _seconds(
+            "queue", "From the arrival of a request for a plan until its planning began.", registry
+        )
         self._plan_seconds = _seconds("plan", "Planning of a request.", registry)
         self._write_seconds = _seconds("write", "Writing the rows of a batch, before its commit.", registry)
         self._commit_seconds = _seconds("commit", "The commit of a batch.", registry)

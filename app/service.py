@@ -13,13 +13,14 @@ import structlog
 from fastapi import Depends, Request
 
 from app import auth
-from app.deconfliction import Deconfliction, Policy
+from app.deconfliction import Deconfliction, OccupancyReplica, log_intents
 from app.errors import ReadOnlyServer, StartupError
 from app.ledger import Ledger, create_or_upgrade, open_ledger
 from app.ledger_probe import LedgerProbe
 from app.metrics import Metrics
 from app.settings import Settings
 from app.times import monotonic_ms
+from app.writer import Policy, Writer
 from planner.aircraft import AircraftType, merged, read_aircraft_types, shipped_aircraft_types
 from planner.airspace import Airspace, read_airspace
 from planner.buildings import shipped_airspace
@@ -48,24 +49,45 @@ class Basis:
 
 
 @dataclass(frozen=True)
+class Writing:
+    """What a process that writes has beyond one that only reads."""
+
+    writer: Writer
+    deconfliction: Deconfliction
+
+
+@dataclass(frozen=True)
 class Service:
-    """The parts of a running process; one that only reads has no `deconfliction`."""
+    """The parts of a running process; `writing` are those that one which only reads has not."""
 
     settings: Settings
     airspace: Airspace
     aircraft_types: Mapping[str, AircraftType]
     ledger: Ledger
-    deconfliction: Deconfliction | None
+    writing: Writing | None
     clock: Callable[[], int]
     metrics: Metrics
     probe: LedgerProbe
 
     @property
-    def writer(self) -> Deconfliction:
-        """What plans and writes; raises `ReadOnlyServer` where nothing does."""
-        if self.deconfliction is None:
+    def is_read_only(self) -> bool:
+        """Whether this process only reads."""
+        return self.writing is None
+
+    @property
+    def writer(self) -> Writer:
+        """The only writer; raises `ReadOnlyServer` where there is none."""
+        return self._writing().writer
+
+    @property
+    def deconfliction(self) -> Deconfliction:
+        """What plans and records flights; raises `ReadOnlyServer` where nothing does."""
+        return self._writing().deconfliction
+
+    def _writing(self) -> Writing:
+        if self.writing is None:
             raise ReadOnlyServer("this server only answers reads; send the request to one that writes")
-        return self.deconfliction
+        return self.writing
 
 
 def load_airspace(settings: Settings) -> Airspace:
@@ -151,55 +173,55 @@ def started(
         # Opening the projection takes as long as a hundred plans: not in the first request.
         airspace.grid.project(*airspace.grid.bounds[:2])
         metrics = Metrics()
-        deconfliction = None
+        writing = None
         if not settings.read_only:
-            deconfliction = _writer(basis, ledger, clock, elapsed_ms, metrics, on_death)
+            writing = _writing(basis, ledger, clock, elapsed_ms, metrics, on_death)
         try:
             yield Service(
                 settings=settings,
                 airspace=airspace,
                 aircraft_types=basis.aircraft_types,
                 ledger=ledger,
-                deconfliction=deconfliction,
+                writing=writing,
                 clock=clock,
                 metrics=metrics,
                 probe=LedgerProbe(ledger),
             )
         finally:
-            if deconfliction is not None:
-                deconfliction.stop()
+            if writing is not None:
+                writing.writer.stop()
 
 
-def _writer(
+def _writing(
     basis: Basis,
     ledger: Ledger,
     clock: Callable[[], int],
     elapsed_ms: Callable[[], int],
     metrics: Metrics,
     on_death: Callable[[], None],
-) -> Deconfliction:
+) -> Writing:
     settings = basis.settings
     warm_up()
     planner = Planner(basis.airspace, settings.search, int(settings.hover_limit_s * 1000))
     policy = Policy(
-        horizon_ms=int(settings.horizon_days * 86_400_000),
         idempotency_ms=int(settings.idempotency_hours * 3_600_000),
         queue_limit=settings.queue_limit,
         retention_ms=None if settings.retention_days is None else int(settings.retention_days * 86_400_000),
     )
-    deconfliction = Deconfliction(
+    writer = Writer(
         ledger,
-        planner,
-        basis.performances(),
+        OccupancyReplica(planner.index),
         clock,
         policy,
         elapsed_ms=elapsed_ms,
-        observe=metrics.batch,
+        observers=(log_intents, metrics.batch),
         on_death=on_death,
     )
-    deconfliction.start()
+    horizon_ms = int(settings.horizon_days * 86_400_000)
+    deconfliction = Deconfliction(writer, ledger, planner, basis.performances(), horizon_ms)
+    writer.start()
     metrics.index_loaded(len(planner.index))
-    return deconfliction
+    return Writing(writer, deconfliction)
 
 
 async def of_request(request: Request) -> Service:

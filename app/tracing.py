@@ -80,8 +80,8 @@ def _id_of(scope: Scope) -> bytes:
 
 
 def _note_waiting(service: Service) -> None:
-    if service.deconfliction is not None:
-        service.metrics.waiting(service.deconfliction.waiting)
+    if not service.is_read_only:
+        service.metrics.waiting(service.writer.waiting)
 
 
 def _note_answer(service: Service, scope: Scope, answer: _Answer, seconds: float) -> None:

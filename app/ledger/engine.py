@@ -15,10 +15,11 @@ from sqlalchemy.exc import DatabaseError
 from app.errors import AirspaceMismatch, LedgerOutdated, StartupError
 from app.ledger import tables
 from app.ledger.database import Database
-from app.ledger.ledger import Ledger, cause_of, touch
+from app.ledger.ledger import Ledger
 from app.ledger.location import Location, parse_location
 from app.ledger.postgresql import PostgresqlDatabase
 from app.ledger.sqlite import SqliteDatabase
+from app.ledger.transaction import cause_of, touch
 from planner.airspace import Airspace
 
 

@@ -172,7 +172,7 @@ async def submit(
     if idempotency_key is not None:
         digest = hashlib.sha256(orjson.dumps(body.model_dump(), option=orjson.OPT_SORT_KEYS)).hexdigest()
         key = IdempotencyKey(idempotency_key, digest, lambda outcome: _outcome_body(service, outcome))
-    outcome = await service.writer.submit(submission, key)
+    outcome = await service.deconfliction.submit(submission, key)
     return _outcome_response(service, outcome)
 
 
@@ -184,7 +184,7 @@ async def submit(
 )
 async def preview(service: ServiceDep, body: FlightIntentBody) -> Response:
     """Answer what submitting this body would give at this moment; nothing is reserved or recorded."""
-    plan = await service.writer.preview(_located(service, body))
+    plan = await service.deconfliction.preview(_located(service, body))
     if isinstance(plan, Refusal):
         return Response(problems.refusal_body(plan), problems.KINDS[NoPlan].status, media_type=problems.MEDIA_TYPE)
     answer = _planned(service.airspace.grid, "preview", plan.submission, plan.trajectory, plan.reservations)
@@ -243,7 +243,7 @@ def read(service: ServiceDep, intent_id: str) -> Response:
 )
 async def cancel(service: ServiceDep, intent_id: str) -> Response:
     """Cancel an intent. Before departure its blocks are free at once; a departed flight keeps them until arrival."""
-    return _intent_response(service, await service.writer.cancel(_id(intent_id)))
+    return _intent_response(service, await service.deconfliction.cancel(_id(intent_id)))
 
 
 def render(grid: AirMatrix, intent: FlightIntent) -> dict[str, Any]:
@@ -287,7 +287,7 @@ def _located(service: Service, body: FlightIntentBody) -> Submission:
     airspace = service.airspace
     origin_block = airspace.free_block_at(origin.lon, origin.lat, origin.alt_m, OriginBlocked)
     destination_block = airspace.free_block_at(destination.lon, destination.lat, destination.alt_m, DestinationBlocked)
-    service.writer.check(origin_block, destination_block)
+    service.deconfliction.check(origin_block, destination_block)
     latest_ms = body.latest_departure
     if latest_ms is None:
         latest_ms = body.earliest_departure + int(service.settings.ground_hold_s * 1000)

@@ -8,10 +8,10 @@ from fastapi import APIRouter
 from pydantic import BaseModel
 
 from app import problems
-from app.deconfliction import Deconfliction
 from app.errors import LedgerUnavailable, NotReady
 from app.ledger import parse_location
 from app.service import Service, ServiceDep
+from app.writer import Writer
 
 router = APIRouter(tags=["running it"])
 
@@ -60,7 +60,7 @@ async def ready(service: ServiceDep) -> Readiness:
 
     The answer comes within two seconds, whatever the ledger does.
     """
-    writer = service.deconfliction
+    writer = None if service.is_read_only else service.writer
     reasons = [] if writer is None else _troubles_of(writer)
     revision = None
     try:
@@ -88,10 +88,10 @@ async def read_version(service: ServiceDep) -> Version:
 
 
 def _mode(service: Service) -> Mode:
-    return "read-only" if service.deconfliction is None else "read-write"
+    return "read-only" if service.is_read_only else "read-write"
 
 
-def _troubles_of(writer: Deconfliction) -> list[str]:
+def _troubles_of(writer: Writer) -> list[str]:
     """Return why requests that write would not be answered well at present."""
     troubles = []
     if not writer.is_running:

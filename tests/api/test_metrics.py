@@ -19,13 +19,14 @@ from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import OperationalError
 
 from app import problems
-from app.deconfliction import BatchReport, Outcome, PreviewPlan, Request
+from app.deconfliction import Outcome, PreviewPlan
 from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, Refusal, Reservations, State
-from app.ledger.ledger import CommitUncertain
+from app.ledger import CommitUncertain
 from app.main import create_app
 from app.metrics import Metrics
 from app.settings import Settings
+from app.writer import BatchReport, Request
 from planner.errors import NoDepartureSlot, NoPlan, NotPlannable
 from tests.api.bodies import PREVIEW, SUBMIT, intent
 from tests.api.serving import Client, served, serving
@@ -153,11 +154,11 @@ def test_a_replayed_refusal_is_a_replay_and_a_problem_again(client: Client) -> N
     assert moved == total(accepted, refused, outcome("rejected"), outcome("replayed"))
 
 
-def test_a_cancelled_intent_is_counted_and_leaves_the_index(client: Client) -> None:
+def test_a_cancelled_intent_is_counted_but_not_as_planned_and_leaves_the_index(client: Client) -> None:
     with moving(client) as moved:
         client.delete(client.post(SUBMIT, json=intent()).headers["location"])
     accepted = total(http("POST", SUBMIT, 201), outcome("accepted"), WRITTEN)
-    cancelled = total(http("DELETE", f"{SUBMIT}/{{intent_id}}", 200), outcome("cancelled"), WRITTEN)
+    cancelled = total(http("DELETE", f"{SUBMIT}/{{intent_id}}", 200), outcome("cancelled"), BATCH, COMMITTED)
     assert moved == total(accepted, cancelled)
 
 
@@ -262,7 +263,7 @@ def flight_intent(state: State, refusal: Refusal | None = None) -> FlightIntent:
 
 def report(answers: list[object], failure: Exception | None = None, **members: Any) -> BatchReport:
     """Return the report of a batch with these answers."""
-    request = Request(run=lambda *_: None, look_up=lambda: None, future=Future(), context={}, arrived=0.0)
+    request = Request(run=lambda *_: None, look_up=lambda: None, plans=True, future=Future(), context={}, arrived=0.0)
     members = {"queue_s": [], "plan_s": [], "write_s": 0.0, "commit_s": 0.0, "index_size": 0, **members}
     return BatchReport(requests=[request] * len(answers), answers=answers, failure=failure, **members)
 

@@ -2,16 +2,17 @@
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from app.deconfliction import Deconfliction, IdempotencyKey, Outcome, Policy
+from app.deconfliction import Deconfliction, IdempotencyKey, OccupancyReplica, Outcome
 from app.flight_intents import FlightIntent, Submission
 from app.ledger import open_ledger
+from app.writer import BatchReport, Policy, Writer
 from planner.aircraft import shipped_aircraft_types
 from planner.airspace import Airspace
 from planner.cfa_star import Performance, Planner, Search
@@ -22,7 +23,8 @@ from tests.ledger.locations import Stranger, database, write_lock
 Hold = tuple[int, int, int]  # block, enter, exit
 
 DAY_MS = 86_400_000
-POLICY = Policy(horizon_ms=30 * DAY_MS, idempotency_ms=DAY_MS, queue_limit=1024)
+HORIZON_MS = 30 * DAY_MS
+POLICY = Policy(idempotency_ms=DAY_MS, queue_limit=1024)
 
 
 @dataclass
@@ -53,6 +55,7 @@ class Process:
         clock: Callable[[], int],
         *,
         elapsed_ms: Callable[[], int] | None = None,
+        observers: Sequence[Callable[[BatchReport], None]] = (),
         on_death: Callable[[], None] = lambda: None,
         policy: Policy = POLICY,
         search: Search = Search.SAFE_INTERVAL,
@@ -61,10 +64,17 @@ class Process:
         self.ledger = open_ledger(location, airspace, claim=True)
         self.planner = Planner(airspace, search)
         performances = {type_.id: Performance.of(type_, airspace.grid) for type_ in shipped_aircraft_types()}
-        self.deconfliction = Deconfliction(
-            self.ledger, self.planner, performances, clock, policy, elapsed_ms=elapsed_ms or clock, on_death=on_death
+        self.writer = Writer(
+            self.ledger,
+            OccupancyReplica(self.planner.index),
+            clock,
+            policy,
+            elapsed_ms=elapsed_ms or clock,
+            observers=observers,
+            on_death=on_death,
         )
-        self.deconfliction.start()
+        self.deconfliction = Deconfliction(self.writer, self.ledger, self.planner, performances, HORIZON_MS)
+        self.writer.start()
 
     def __enter__(self) -> Self:
         return self
@@ -72,7 +82,7 @@ class Process:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.deconfliction.stop()
+        self.writer.stop()
         self.ledger.close()
 
     def submit(self, submission: Submission, key: IdempotencyKey | None = None) -> FlightIntent:
@@ -90,7 +100,7 @@ class Process:
     async def _together(self, requests: tuple[Coroutine[Any, Any, Any], ...]) -> list[Any]:
         with write_lock(self.location):
             tasks = [asyncio.create_task(request) for request in requests]
-            await until(lambda: self.deconfliction.waiting == len(requests) - 1)
+            await until(lambda: self.writer.waiting == len(requests) - 1)
         return await asyncio.gather(*tasks, return_exceptions=True)
 
     def indexed(self, now_ms: int) -> dict[Hold, int]:

@@ -16,7 +16,7 @@ import structlog
 from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import OperationalError
 
-from app.deconfliction import IdempotencyKey, Outcome, Policy, PreviewPlan
+from app.deconfliction import IdempotencyKey, Outcome, PreviewPlan
 from app.errors import (
     BeyondHorizon,
     DepartureInThePast,
@@ -27,12 +27,14 @@ from app.errors import (
     QueueFull,
     UnknownFlightIntent,
 )
-from app.flight_intents import FlightIntent, Reservations, State, Submission
-from app.ledger import open_ledger
+from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
+from app.ledger import Transaction, open_ledger
+from app.writer import BatchReport, Policy
 from tests.ledger.district import DEPARTURE_MS, SQUARE, START_MS, STREET
 from tests.ledger.locations import Ledgers, database, on_postgresql, on_sqlite, write_lock
 from tests.ledger.process import (
     DAY_MS,
+    HORIZON_MS,
     POLICY,
     FakeClock,
     Hold,
@@ -125,8 +127,8 @@ def test_a_cancellation_takes_a_revision_but_no_sequence_number(square: Process)
     ("earliest_ms", "window_ms", "error"),
     [
         (START_MS - 2, 1, DepartureInThePast),
-        (START_MS, POLICY.horizon_ms + 1, BeyondHorizon),
-        (START_MS + POLICY.horizon_ms + 1, 0, BeyondHorizon),
+        (START_MS, HORIZON_MS + 1, BeyondHorizon),
+        (START_MS + HORIZON_MS + 1, 0, BeyondHorizon),
     ],
 )
 def test_a_request_outside_the_horizon_takes_no_number(
@@ -138,7 +140,7 @@ def test_a_request_outside_the_horizon_takes_no_number(
     assert square.ledger.revision() == 0
 
 
-@pytest.mark.parametrize(("earliest_ms", "window_ms"), [(START_MS - 2, 2), (START_MS, POLICY.horizon_ms)])
+@pytest.mark.parametrize(("earliest_ms", "window_ms"), [(START_MS - 2, 2), (START_MS, HORIZON_MS)])
 def test_the_first_and_the_last_moment_of_the_horizon_are_accepted(
     square: Process, earliest_ms: int, window_ms: int
 ) -> None:
@@ -256,7 +258,7 @@ def test_text_that_the_database_cannot_take_harms_only_who_sent_it(square: Proce
     assert isinstance(after, Outcome)
     assert isinstance(refused, LedgerUnavailable)
     assert [before.intent.sequence, after.intent.sequence] == [1, 2]
-    assert square.deconfliction.trouble is None
+    assert square.writer.trouble is None
     assert_sound(square)
 
 
@@ -410,8 +412,8 @@ def test_while_the_ledger_fails_nobody_waits_for_it(square: Process) -> None:
 def test_the_writer_notices_by_itself_that_the_ledger_can_be_written_again(square: Process) -> None:
     with unwritable(), pytest.raises(LedgerUnavailable):
         square.submit(SQUARE.submission("N", "S"))
-    assert square.deconfliction.trouble is not None
-    asyncio.run(until(lambda: square.deconfliction.trouble is None))
+    assert square.writer.trouble is not None
+    asyncio.run(until(lambda: square.writer.trouble is None))
     assert square.submit(SQUARE.submission("N", "S")).sequence == 1
     assert_sound(square)
 
@@ -457,7 +459,7 @@ def test_a_log_that_cannot_be_written_stops_nothing_and_reserves_nothing_twice(s
         first = street.submit(STREET.submission("W", "E"))
         with on_next_commit(fail), pytest.raises(LedgerUnavailable):
             street.submit(STREET.submission("W", "E"))
-        asyncio.run(until(lambda: street.deconfliction.trouble is None))
+        asyncio.run(until(lambda: street.writer.trouble is None))
         with on_next_commit(commit_and_fail):
             second = street.submit(STREET.submission("W", "E"))
     assert (first.sequence, second.sequence) == (1, 2)
@@ -624,7 +626,7 @@ def test_a_ledger_that_was_moved_is_noticed_before_anything_is_accepted(replaced
         square.ledger.find(first.id)
     assert path.exists() is replaced
     path.with_suffix(".moved").rename(path)
-    asyncio.run(until(lambda: square.deconfliction.trouble is None))
+    asyncio.run(until(lambda: square.writer.trouble is None))
     assert square.submit(SQUARE.submission("N", "S")).sequence == 2
     assert_sound(square)
 
@@ -647,6 +649,68 @@ def test_an_unexpected_error_in_one_request_harms_neither_its_neighbours_nor_the
     assert_sound(square)
 
 
+# Work that plans nothing
+
+
+def test_work_is_done_under_the_write_lock_and_durable_before_its_answer(square: Process) -> None:
+    request = SQUARE.submission("N", "S")
+
+    def record(transaction: Transaction, now: int) -> FlightIntent:
+        return transaction.record(intent_id="an id", submission=request, now_ms=now, refusal=Refusal("why", "because"))
+
+    recorded = asyncio.run(square.writer.perform(record, lambda: None))
+    found = square.ledger.find("an id")
+    assert found is not None
+    assert (found.sequence, found.received_ms) == (recorded.sequence, START_MS) == (1, START_MS)
+
+
+def test_work_that_fails_after_it_has_written_is_undone(square: Process) -> None:
+    def record_and_fail(transaction: Transaction, now: int) -> Never:
+        transaction.record(
+            intent_id="an id", submission=SQUARE.submission("N", "S"), now_ms=now, refusal=Refusal("why", "because")
+        )
+        raise IllegalTransition("after all, no")
+
+    with pytest.raises(IllegalTransition):
+        asyncio.run(square.writer.perform(record_and_fail, lambda: None))
+    assert square.ledger.find("an id") is None
+    assert_gapless(square.location)
+
+
+@pytest.mark.parametrize("answer", [0, "", [], False])
+def test_what_was_done_although_its_commit_was_lost_is_answered_however_little_it_is(
+    square: Process, answer: object
+) -> None:
+    with on_next_commit(commit_and_fail):
+        assert asyncio.run(square.writer.perform(lambda *_: answer, lambda: answer)) == answer
+
+
+def test_what_is_not_found_after_its_commit_was_lost_was_not_recorded(square: Process) -> None:
+    with on_next_commit(fail), pytest.raises(LedgerUnavailable, match="nothing was recorded"):
+        asyncio.run(square.writer.perform(lambda *_: 1, lambda: None))
+
+
+def test_the_seconds_of_work_are_reported_only_if_it_plans(ledger: str, clock: FakeClock) -> None:
+    reports: list[BatchReport] = []
+    with Process(ledger, SQUARE.airspace, clock, observers=[reports.append]) as process:
+        intent = process.submit(SQUARE.submission("N", "S"))
+        process.cancel(intent)
+    assert [len(report.requests) for report in reports] == [1, 1]
+    assert [(len(report.queue_s), len(report.plan_s)) for report in reports] == [(1, 1), (0, 0)]
+
+
+def test_an_observer_that_fails_harms_neither_the_others_nor_the_writer(ledger: str, clock: FakeClock) -> None:
+    reports: list[BatchReport] = []
+
+    def fail_to_observe(_: BatchReport) -> Never:
+        raise RuntimeError("a bug")
+
+    with Process(ledger, SQUARE.airspace, clock, observers=[fail_to_observe, reports.append]) as process:
+        for _ in range(2):
+            process.submit(SQUARE.submission("N", "S"))
+    assert len(reports) == 2
+
+
 # Requests that are given up
 
 
@@ -655,14 +719,14 @@ def test_a_request_that_is_given_up_while_it_is_planned_does_not_stop_the_writer
         with write_lock(square.location):
             given_up = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
             last = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("S", "N")))
-            await until(lambda: square.deconfliction.waiting == 1)
+            await until(lambda: square.writer.waiting == 1)
             given_up.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await given_up
         return await asyncio.wait_for(last, timeout=2)
 
     assert asyncio.run(give_up()).intent.sequence == 2
-    assert square.deconfliction.is_running
+    assert square.writer.is_running
     assert_sound(square)
 
 
@@ -672,7 +736,7 @@ def test_a_request_that_is_given_up_in_the_queue_does_not_stop_the_writer(square
             first = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
             given_up = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S")))
             last = asyncio.create_task(square.deconfliction.submit(SQUARE.submission("S", "N")))
-            await until(lambda: square.deconfliction.waiting == 2)
+            await until(lambda: square.writer.waiting == 2)
             given_up.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await given_up
@@ -680,12 +744,12 @@ def test_a_request_that_is_given_up_in_the_queue_does_not_stop_the_writer(square
         return await asyncio.wait_for(last, timeout=2)
 
     assert asyncio.run(give_up()).intent.state is State.ACCEPTED
-    assert square.deconfliction.is_running
+    assert square.writer.is_running
     assert_sound(square)
 
 
 def test_a_request_to_a_writer_that_has_stopped_is_refused_at_once(square: Process) -> None:
-    square.deconfliction.stop()
+    square.writer.stop()
 
     async def submit() -> None:
         await asyncio.wait_for(square.deconfliction.submit(SQUARE.submission("N", "S")), timeout=2)
@@ -698,9 +762,9 @@ def test_stopping_finishes_what_waits(square: Process) -> None:
     async def stop_meanwhile() -> list[Outcome]:
         with write_lock(square.location):
             tasks = [asyncio.create_task(square.deconfliction.submit(SQUARE.submission("N", "S"))) for _ in range(3)]
-            await until(lambda: square.deconfliction.waiting == 2)
-            stopping = asyncio.create_task(asyncio.to_thread(square.deconfliction.stop))
-            await until(lambda: square.deconfliction.waiting == 3)
+            await until(lambda: square.writer.waiting == 2)
+            stopping = asyncio.create_task(asyncio.to_thread(square.writer.stop))
+            await until(lambda: square.writer.waiting == 3)
         await stopping
         return await asyncio.gather(*tasks)
 
@@ -708,14 +772,14 @@ def test_stopping_finishes_what_waits(square: Process) -> None:
 
 
 def test_a_full_queue_takes_nothing(ledger: str, clock: FakeClock) -> None:
-    policy = Policy(POLICY.horizon_ms, POLICY.idempotency_ms, queue_limit=1)
+    policy = Policy(POLICY.idempotency_ms, queue_limit=1)
     with Process(ledger, SQUARE.airspace, clock, policy=policy) as process:
 
         async def overfill() -> list[Outcome]:
             with write_lock(process.location):
                 first = asyncio.create_task(process.deconfliction.submit(SQUARE.submission("N", "S")))
                 await asyncio.sleep(0)
-                await until(lambda: process.deconfliction.waiting == 0)
+                await until(lambda: process.writer.waiting == 0)
                 second = asyncio.create_task(process.deconfliction.submit(SQUARE.submission("N", "S")))
                 await asyncio.sleep(0)
                 with pytest.raises(QueueFull, match="1 requests are waiting"):

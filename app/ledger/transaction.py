@@ -1,0 +1,314 @@
+"""The only writes: one transaction at a time, which holds the database's write lock from its start.
+
+Whoever opens one sees everything committed before it, so `sequence` and `revision` are gapless and in the order of the
+lock.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import takewhile
+from typing import Any
+
+from sqlalchemy import Connection, delete, func, insert, select, tuple_, update
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+
+from app.errors import LedgerUnavailable
+from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
+from app.ledger import queries
+from app.ledger.queries import IdempotencyRecord, JournalEntry
+from app.ledger.rows import HeldReservations, columns_of, dump_columns, joined, to_held, to_row
+from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
+from planner.airspace import Airspace
+from planner.path import Trajectory
+
+# In a connection's notes.
+_SEEN = "airmatrix has seen this database"
+
+InsertReservations = Callable[[Connection, HeldReservations], None]
+
+
+class ConstraintViolated(Exception):
+    """The database refused rows, such as an overlapping reservation: the caller's picture of the ledger was wrong."""
+
+
+class Transaction:
+    """Work on the ledger under the write lock.
+
+    New rows wait in memory until `flush`, which writes those of many intents at once; what reads them sees them.
+    """
+
+    def __init__(self, connection: Connection, airspace: Airspace, insert_reservations: InsertReservations) -> None:
+        self._connection = connection
+        self._airspace = airspace
+        self._insert_reservations = insert_reservations
+        self._counters = self._written = _Counters(*connection.execute(select(*_COUNTERS)).one())
+        self._forget_pending()
+        self.write_s = 0.0
+        self.commit_s = 0.0
+
+    @property
+    def revision(self) -> int:
+        """The newest revision, with what this transaction has added."""
+        return self._counters.revision
+
+    @property
+    def journal_removed(self) -> int:
+        """The revision up to which the journal has been removed."""
+        return self._counters.journal_removed
+
+    @contextmanager
+    def savepoint(self) -> Iterator[None]:
+        """Write what happens inside, or undo it.
+
+        Raises
+        ------
+        ConstraintViolated
+        LedgerUnavailable
+            Any other failure of the database: the whole transaction is lost.
+        """
+        self.flush()
+        before = self._counters
+        try:
+            with self._connection.begin_nested():
+                yield
+                self.flush()
+        except DataError as error:
+            self._undo(before)
+            raise ConstraintViolated(cause_of(error)) from error
+        except DBAPIError as error:
+            raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
+        except BaseException:
+            self._undo(before)
+            raise
+
+    def _undo(self, before: "_Counters") -> None:
+        self._counters = self._written = before
+        self._forget_pending()
+
+    def record(
+        self,
+        *,
+        intent_id: str,
+        submission: Submission,
+        now_ms: int,
+        trajectory: Trajectory | None = None,
+        reservations: Reservations | None = None,
+        refusal: Refusal | None = None,
+    ) -> FlightIntent:
+        """Add an intent, accepted with its reservations or rejected, under the next sequence number."""
+        state = State.REJECTED if trajectory is None else State.ACCEPTED
+        counters = self._counters
+        self._counters = replace(
+            counters,
+            sequence=counters.sequence + 1,
+            longest_flight=max(counters.longest_flight, 0 if trajectory is None else trajectory.flight_time_ms),
+        )
+        revision = self._append(self._counters.sequence, intent_id, now_ms, state, released=None)
+        intent = FlightIntent(
+            id=intent_id,
+            sequence=self._counters.sequence,
+            version=revision,
+            state=state,
+            submission=submission,
+            received_ms=now_ms,
+            trajectory=trajectory,
+            reservations=reservations or Reservations.none(),
+            refusal=refusal,
+        )
+        self._new_intents[intent_id] = intent
+        return intent
+
+    def release(self, intent: FlightIntent, state: State, now_ms: int, keep: bool) -> FlightIntent:
+        """Move an intent to another state; unless `keep`, delete its reservations."""
+        self.flush()
+        released = None if keep else intent.reservations
+        if released is not None:
+            self._connection.execute(delete(reservations).where(reservations.c.intent == intent.sequence))
+        revision = self._append(intent.sequence, intent.id, now_ms, state, released)
+        self._connection.execute(
+            update(flight_intents)
+            .where(flight_intents.c.sequence == intent.sequence)
+            .values(state=state.value, version=revision)
+        )
+        return intent.changed(revision, state, intent.reservations if keep else Reservations.none())
+
+    def find(self, intent_id: str) -> FlightIntent | None:
+        """Return an intent with its reservations, None if there is none."""
+        if intent_id in self._new_intents:
+            self.flush()
+        return queries.find(self._connection, self._airspace, intent_id)
+
+    def ids(self, sequences: Iterable[int]) -> dict[int, str]:
+        """Return the ids of intents by their sequence numbers."""
+        wanted = set(sequences)
+        new = {intent.sequence: id_ for id_, intent in self._new_intents.items() if intent.sequence in wanted}
+        return new | (queries.ids_of(self._connection, wanted - new.keys()) if wanted - new.keys() else {})
+
+    def journal_after(self, revision: int) -> list[JournalEntry]:
+        """Return all journal entries after a revision, oldest first."""
+        return queries.journal_after(self._connection, revision, None)
+
+    def held_after(self, time_ms: int, sequences: Sequence[int] | None = None) -> HeldReservations:
+        """Return the reservations that end after a time, of all intents or of some, by intent."""
+        self.flush()
+        query = select(reservations).where(reservations.c.exit > time_ms)
+        if sequences is not None:
+            query = query.where(reservations.c.intent.in_(sequences))
+        else:
+            # Found by their flights: the ledger may hold years of reservations.
+            query = query.where(queries.in_the_air(time_ms, None))
+        return to_held(self._connection.execute(query.order_by(reservations.c.intent)))
+
+    def answer_to(self, operator: str, key: str, since_ms: int) -> IdempotencyRecord | None:
+        """Return the first answer to an idempotency key, None if it is new; one from before `since_ms` is dropped."""
+        new = self._new_answers.get((operator, key))
+        if new is not None:
+            return new
+        found = queries.answer_to(self._connection, self._airspace, operator, key)
+        if found is None or found.created_ms >= since_ms:
+            return found
+        this = (idempotency_keys.c.operator == operator) & (idempotency_keys.c.key == key)
+        self._connection.execute(delete(idempotency_keys).where(this))
+        return None
+
+    def remember_answer(
+        self, operator: str, key: str, body_digest: str, intent: FlightIntent, answer: bytes, now_ms: int
+    ) -> None:
+        """Keep the first answer to an idempotency key."""
+        self._new_answers[operator, key] = IdempotencyRecord(body_digest, intent, answer, now_ms)
+        self._new_keys.append(
+            {
+                "operator": operator, "key": key, "body_digest": body_digest,
+                "intent": intent.sequence, "answer": answer.decode(), "created": now_ms,
+            }
+        )  # fmt: skip
+
+    def remove_answers(self, before_ms: int, limit: int) -> int:
+        """Drop up to `limit` idempotency keys first used before a time; return how many."""
+        self.flush()
+        name = tuple_(idempotency_keys.c.operator, idempotency_keys.c.key)
+        created = idempotency_keys.c.created
+        query = select(idempotency_keys.c.operator, idempotency_keys.c.key).where(created < before_ms)
+        old = [tuple(row) for row in self._connection.execute(query.order_by(created).limit(limit))]
+        if old:
+            self._connection.execute(delete(idempotency_keys).where(name.in_(old)))
+        return len(old)
+
+    def remove_ended(self, before_ms: int, limit: int) -> int:
+        """Remove up to `limit` intents that ended before a time, with all they held; return how many.
+
+        An intent stays while an idempotency key needs it.
+        """
+        self.flush()
+        ends = func.coalesce(flight_intents.c.arrival, flight_intents.c.latest_departure)
+        has_key = select(idempotency_keys.c.key).where(idempotency_keys.c.intent == flight_intents.c.sequence).exists()
+        query = select(flight_intents.c.sequence).where(ends < before_ms, ~has_key).order_by(ends).limit(limit)
+        sequences = list(self._connection.execute(query).scalars())
+        if sequences:
+            self._connection.execute(delete(reservations).where(reservations.c.intent.in_(sequences)))
+            self._connection.execute(delete(flight_intents).where(flight_intents.c.sequence.in_(sequences)))
+            removed_before = max(self._counters.removed_before, before_ms)
+            self._counters = replace(self._counters, removed_before=removed_before)
+        return len(sequences)
+
+    def remove_journal(self, before_ms: int, limit: int) -> int:
+        """Remove up to `limit` of the oldest journal entries, if they are from before a time; return how many."""
+        self.flush()
+        query = select(journal.c.revision, journal.c.time).order_by(journal.c.revision).limit(limit)
+        old = list(takewhile(lambda row: row.time < before_ms, self._connection.execute(query).all()))
+        # The newest entry stays: its time tells how far the ledger's own time has come.
+        if old and old[-1].revision == self.revision:
+            old.pop()
+        if old:
+            self._counters = replace(self._counters, journal_removed=old[-1].revision)
+            self.flush()
+            self._connection.execute(delete(journal).where(journal.c.revision <= old[-1].revision))
+        return len(old)
+
+    def newest_change(self) -> int | None:
+        """Return when the newest change was recorded, None if there has been none."""
+        query = select(journal.c.time).order_by(journal.c.revision.desc()).limit(1)
+        return self._connection.execute(query).scalar_one_or_none()
+
+    @property
+    def on_new_connection(self) -> bool:
+        """Whether nobody has called `seen` on this connection: it may lead to another database than before."""
+        return _SEEN not in self._connection.info
+
+    def seen(self) -> None:
+        """Take down that what this connection leads to is known."""
+        self._connection.info[_SEEN] = True
+
+    def touch(self) -> None:
+        """Write something that changes nothing: a commit that succeeds proves that the ledger can be written."""
+        touch(self._connection)
+
+    def flush(self) -> None:
+        """Write the rows that wait, and how far the counters have come; raises `ConstraintViolated`."""
+        if self._counters == self._written:
+            return
+        began = time.perf_counter()
+        intents = list(self._new_intents.values())
+        try:
+            if intents:
+                self._connection.execute(insert(flight_intents), [to_row(intent) for intent in intents])
+            if any(len(intent.reservations) for intent in intents):
+                self._insert_reservations(self._connection, joined(intents))
+            if self._new_entries:
+                self._connection.execute(insert(journal), self._new_entries)
+            if self._new_keys:
+                self._connection.execute(insert(idempotency_keys), self._new_keys)
+            self._connection.execute(update(counters).values(asdict(self._counters)))
+        except IntegrityError as error:
+            raise ConstraintViolated(cause_of(error)) from error
+        self._written = self._counters
+        self._forget_pending()
+        self.write_s += time.perf_counter() - began
+
+    def _forget_pending(self) -> None:
+        self._new_intents: dict[str, FlightIntent] = {}
+        self._new_entries: list[dict[str, Any]] = []
+        self._new_keys: list[dict[str, Any]] = []
+        self._new_answers: dict[tuple[str, str], IdempotencyRecord] = {}
+
+    def _append(self, sequence: int, intent_id: str, now_ms: int, kind: State, released: Reservations | None) -> int:
+        """Add a journal entry under the next revision, and return that."""
+        self._counters = replace(self._counters, revision=self._counters.revision + 1)
+        self._new_entries.append(
+            {
+                "revision": self.revision,
+                "time": now_ms,
+                "kind": kind.value,
+                "intent": sequence,
+                "flight_intent_id": intent_id,
+                "released": None if released is None else dump_columns(*columns_of(released)),
+            }
+        )
+        return self.revision
+
+
+@dataclass(frozen=True)
+class _Counters:
+    """The one row of `counters`."""
+
+    sequence: int
+    revision: int
+    longest_flight: int
+    removed_before: int
+    journal_removed: int
+
+
+_COUNTERS = [counters.c[field.name] for field in fields(_Counters)]
+
+
+def touch(connection: Connection) -> None:
+    """Change a row and change it back: SQLite writes nothing for an update to what is there already."""
+    for step in (1, -1):
+        connection.execute(update(counters).values(revision=counters.c.revision + step))
+
+
+def cause_of(error: BaseException) -> str:
+    """Return what a database says in one line."""
+    return " ".join(str(getattr(error, "orig", None) or error).split())
