@@ -5,7 +5,7 @@ INSTALLED := $(VENV)/.installed
 PEERS := $(VENV)/.peers
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve test bench faults soak lint lock openapi
+.PHONY: help install serve demo test bench faults soak lint lock openapi
 
 help:  ## Show these targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -21,6 +21,9 @@ install: $(INSTALLED)  ## Create .venv with everything locked
 
 serve: $(INSTALLED)  ## Run the service on http://127.0.0.1:8000
 	$(BIN)/airmatrix serve
+
+demo: $(INSTALLED)  ## Show it: a service, traffic, flying aircraft, and the console's address
+	@$(BIN)/airmatrix demo
 
 test: $(INSTALLED)  ## Run the tests
 	$(BIN)/pytest

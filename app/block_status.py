@@ -1,35 +1,97 @@
-"""Green, yellow or red: what a block's reservations say of it at one time (paper 2.1). Pure.
+"""Green, yellow or red: a block's reservation against the aircraft in it (paper 2.1). Pure.
 
-Without telemetry nothing is known of deviations, so every reserved block is green and the others are idle.
+Red beats yellow beats green; blocks with neither reservation nor aircraft are idle and not listed.
 """
 
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from app.ledger.rows import HeldReservations
+from app.conformance import Assessment
+from app.flight_intents import State
+from app.surveillance import Aircraft, AirPicture
+from planner.airspace import BoolArray
 
 
 class Status(StrEnum):
-    """A block's status; red beats yellow beats green."""
+    """A block's status."""
 
     GREEN = "green"
     YELLOW = "yellow"
     RED = "red"
 
 
-@dataclass(frozen=True)
+class Alarm(StrEnum):
+    """Why a block is red."""
+
+    SEVERAL_AIRCRAFT = "several_aircraft"
+    RESERVED_BY_ANOTHER = "reserved_by_another"
+    IN_BUILDING = "in_building"
+
+
+UNPLANNED_USE = "unplanned_use"
+
+
+@dataclass(frozen=True, slots=True)
 class BlockStatus:
-    """One block in use: its status, all reasons for it, and the sequence numbers of the intents concerned."""
+    """One block in use: its status, all reasons for it, and the aircraft concerned, who has reserved it first."""
 
     block: int
     status: Status
     reasons: tuple[str, ...]
-    sequences: tuple[int, ...]
+    aircraft: tuple[Aircraft, ...]
 
 
-def statuses(held: HeldReservations) -> list[BlockStatus]:
-    """Return the blocks in use, given the reservations that cover one time; at most one a block."""
-    return [
-        BlockStatus(block, Status.GREEN, (), (sequence,))
-        for block, sequence in zip(held.block.tolist(), held.sequence.tolist(), strict=True)
-    ]
+def statuses(
+    picture: AirPicture, assessed: Mapping[Aircraft, Assessment], occupied: BoolArray
+) -> tuple[list[BlockStatus], dict[Aircraft, Assessment]]:
+    """Return the blocks in use at the picture's time, by block, and the assessments with the alarms of red blocks."""
+    reserved_by = _reserved_by(picture)
+    present: dict[int, list[Aircraft]] = defaultdict(list)
+    for aircraft, assessment in assessed.items():
+        if assessment.place is not None:
+            present[assessment.place].append(aircraft)
+    blocks, alarms = [], {}
+    for block in sorted(reserved_by.keys() | present.keys()):
+        holder, here = reserved_by.get(block), present.get(block, [])
+        red = _alarms(holder, here, is_occupied=bool(occupied[block]))
+        yellow = _deviations(holder, here, assessed)
+        status = Status.RED if red else Status.YELLOW if yellow else Status.GREEN
+        concerned = dict.fromkeys([*([] if holder is None else [holder]), *here])
+        blocks.append(BlockStatus(block, status, (*red, *yellow), tuple(concerned)))
+        if red:
+            alarms.update(dict.fromkeys(here, red))
+    return blocks, {
+        aircraft: replace(assessment, alarms=alarms[aircraft]) if aircraft in alarms else assessment
+        for aircraft, assessment in assessed.items()
+    }
+
+
+def _reserved_by(picture: AirPicture) -> dict[int, Aircraft]:
+    """Return who holds each block at the picture's time; at most one does."""
+    held = picture.held
+    covers = (held.enter_ms <= picture.at_ms) & (held.exit_ms > picture.at_ms)
+    return {
+        block: Aircraft(sequence)
+        for block, sequence in zip(held.block[covers].tolist(), held.sequence[covers].tolist(), strict=True)
+    }
+
+
+def _alarms(holder: Aircraft | None, here: list[Aircraft], *, is_occupied: bool) -> tuple[str, ...]:
+    return (
+        *([Alarm.SEVERAL_AIRCRAFT] if len(here) > 1 else []),
+        *([Alarm.RESERVED_BY_ANOTHER] if holder is not None and any(each != holder for each in here) else []),
+        *([Alarm.IN_BUILDING] if is_occupied and here else []),
+    )
+
+
+def _deviations(
+    holder: Aircraft | None, here: list[Aircraft], assessed: Mapping[Aircraft, Assessment]
+) -> tuple[str, ...]:
+    if holder is None:
+        return (UNPLANNED_USE,) if here else ()
+    assessment = assessed[holder]
+    assert assessment.flight is not None
+    contingent = (State.CONTINGENT.value,) if assessment.flight.state is State.CONTINGENT else ()
+    return (*(assessment.reasons if assessment.deviates else ()), *contingent)

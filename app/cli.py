@@ -13,7 +13,9 @@ from pydantic import ValidationError
 from app.client import ClientError
 from app.commands.airspace import airspace_app
 from app.commands.db import db_app
+from app.commands.demo import demo
 from app.commands.experiment import experiment_app
+from app.commands.fly import fly
 from app.commands.load import load
 from app.commands.plan import plan
 from app.commands.serve import serve
@@ -35,9 +37,11 @@ cli.add_typer(airspace_app, name="airspace")
 cli.add_typer(db_app, name="db")
 cli.add_typer(experiment_app, name="experiment")
 cli.command()(serve)
+cli.command()(demo)
 cli.command()(plan)
 cli.command()(simulate)
 cli.command()(load)
+cli.command()(fly)
 cli.command()(size_blocks)
 cli.command()(verify)
 

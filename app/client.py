@@ -6,19 +6,23 @@ ClientError
 └── ProblemAnswer        the service answered with a problem document
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 from urllib.parse import quote
 
 import httpx
+import orjson
 from pydantic import BaseModel, ValidationError
 
 from app.flight_intents import State
 from app.routes.aircraft_types import AircraftTypeAnswer, AircraftTypeList
-from app.routes.airspace import AirspaceAnswer, StaticAnswer, StatusAnswer
+from app.routes.airspace import AirspaceAnswer, StaticAnswer
 from app.routes.events import EventPage
 from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody, FlightIntentPage, PlannedFlightBody
+from app.routes.flights import AlertList, FlightList
 from app.routes.health import Readiness
+from app.routes.status import StatusAnswer
+from app.routes.telemetry import TelemetryAnswer
 from app.times import format_time
 from planner.airmatrix import AirMatrix
 
@@ -84,9 +88,15 @@ class Client:
         """Read a flight intent."""
         return self._send(FlightIntentAnswer, "GET", f"/v1/flight-intents/{quote(intent_id, safe='')}")
 
-    def flight_intents(self, operator: str | None = None, state: State | None = None) -> Iterator[FlightIntentAnswer]:
-        """Yield all flight intents by sequence, page by page."""
-        wanted = {"operator": operator, "state": None if state is None else state.value}
+    def flight_intents(
+        self, operator: str | None = None, state: State | None = None, from_ms: int | None = None
+    ) -> Iterator[FlightIntentAnswer]:
+        """Yield all flight intents by sequence, page by page; `from_ms`: only those that arrive then or later."""
+        wanted = {
+            "operator": operator,
+            "state": None if state is None else state.value,
+            "from": None if from_ms is None else format_time(from_ms),
+        }
         parameters = {name: value for name, value in wanted.items() if value is not None}
         while True:
             page = self._send(FlightIntentPage, "GET", "/v1/flight-intents", params=parameters)
@@ -98,6 +108,32 @@ class Client:
     def cancel(self, intent_id: str) -> FlightIntentAnswer:
         """Cancel a flight intent."""
         return self._send(FlightIntentAnswer, "DELETE", f"/v1/flight-intents/{quote(intent_id, safe='')}")
+
+    def activate(self, intent_id: str) -> FlightIntentAnswer:
+        """Say that the flight begins."""
+        return self._send(FlightIntentAnswer, "POST", f"/v1/flight-intents/{quote(intent_id, safe='')}/activate")
+
+    def end(self, intent_id: str) -> FlightIntentAnswer:
+        """Say that the flight is over."""
+        return self._send(FlightIntentAnswer, "POST", f"/v1/flight-intents/{quote(intent_id, safe='')}/end")
+
+    def telemetry(self, positions: Sequence[Mapping[str, object]]) -> TelemetryAnswer:
+        """Report positions; each that is refused has a problem in the answer."""
+        return self._send(
+            TelemetryAnswer,
+            "POST",
+            "/v1/telemetry",
+            content=orjson.dumps({"positions": positions}),
+            headers={"Content-Type": "application/json"},
+        )
+
+    def flights(self) -> FlightList:
+        """List the flights and tracks that fly or should, with their newest positions."""
+        return self._send(FlightList, "GET", "/v1/flights")
+
+    def alerts(self) -> AlertList:
+        """List what deviates, newest first."""
+        return self._send(AlertList, "GET", "/v1/airspace/alerts")
 
     def airspace(self) -> AirspaceAnswer:
         """Read the airspace."""

@@ -6,7 +6,7 @@ reads is a replica of the ledger's reservations; only work in the writer's threa
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -14,8 +14,9 @@ import structlog
 from uuid_utils import uuid7
 
 from app.errors import BeyondHorizon, DepartureInThePast, IdempotencyKeyReused, IllegalTransition, UnknownFlightIntent
-from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
+from app.flight_intents import OPEN_STATES, FlightIntent, Refusal, Reservations, State, Submission
 from app.ledger import Ledger, Transaction
+from app.surveillance import Aircraft
 from app.times import format_time
 from app.writer import BatchReport, Writer
 from planner.cfa_star import Performance, Planner, PlanRequest
@@ -49,6 +50,13 @@ class Timing:
     queue_s: float = 0.0
     plan_s: float = 0.0
     commit_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Flights that moved to other states by themselves."""
+
+    intents: Sequence[FlightIntent]
 
 
 @dataclass(frozen=True)
@@ -182,6 +190,48 @@ class Deconfliction:
 
         return await self._writer.perform(lambda transaction, now: self._cancel(transaction, now, intent_id), look_up)
 
+    async def activate(self, intent_id: str) -> FlightIntent:
+        """Take down that an accepted flight is about to fly, or flies; raises as `cancel`."""
+
+        def look_up() -> FlightIntent | None:
+            intent = self._ledger.find(intent_id)
+            return intent if intent is not None and intent.activated_ms is not None else None
+
+        return await self._writer.perform(lambda transaction, now: self._activate(transaction, now, intent_id), look_up)
+
+    async def end(self, intent_id: str) -> FlightIntent:
+        """End a flight. One that has departed and was not reported landed keeps its reservations until its arrival;
+        raises as `cancel`.
+        """
+
+        def look_up() -> FlightIntent | None:
+            intent = self._ledger.find(intent_id)
+            return intent if intent is not None and intent.state is State.ENDED else None
+
+        def run(transaction: Transaction, now: int) -> FlightIntent:
+            intent = _found(transaction, intent_id)
+            return intent if intent.state is State.ENDED else self.move(transaction, now, intent, State.ENDED)
+
+        return await self._writer.perform(run, look_up)
+
+    def move(self, transaction: Transaction, now: int, intent: FlightIntent, state: State) -> FlightIntent:
+        """Move an open flight to a state under the write lock; raises `IllegalTransition`.
+
+        Ending or cancelling it frees its blocks where it has not departed, or was seen on the ground since.
+        """
+        if intent.state not in OPEN_STATES or intent.trajectory is None:
+            raise IllegalTransition(f"flight intent {intent.id} is {intent.state} and cannot become {state}")
+        is_over = state in (State.ENDED, State.CANCELLED)
+        is_free = is_over and (
+            now < intent.trajectory.departure_ms or _has_landed(transaction, intent, intent.trajectory.departure_ms)
+        )
+        changed = transaction.change(intent, state, now, is_free=is_free)
+        if is_free:
+            freed, kept = intent.reservations.beyond(now), changed.reservations.beyond(now)
+            self._planner.index.release(freed.block, freed.enter_ms, freed.exit_ms)
+            self._planner.index.reserve(kept.block, kept.enter_ms, kept.exit_ms, intent.sequence)
+        return changed
+
     def _plan(self, submission: Submission, now: int) -> Plan:
         """Plan against the index; raises as `submit`, and `NoPlan`."""
         if submission.latest_departure_ms < now:
@@ -240,9 +290,7 @@ class Deconfliction:
         return Outcome(intent, rendered=rendered)
 
     def _cancel(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
-        intent = transaction.find(intent_id)
-        if intent is None:
-            raise UnknownFlightIntent(f"there is no flight intent {intent_id}")
+        intent = _found(transaction, intent_id)
         if intent.state is State.CANCELLED:
             return intent
         if intent.state is not State.ACCEPTED or intent.trajectory is None:
@@ -252,12 +300,36 @@ class Deconfliction:
                 f"flight intent {intent_id} arrived at {format_time(intent.trajectory.arrival_ms)} "
                 "and cannot be cancelled any more"
             )
-        in_flight = intent.trajectory.departure_ms <= now
-        cancelled = transaction.release(intent, State.CANCELLED, now, keep=in_flight)
-        if not in_flight:
-            held = intent.reservations
-            self._planner.index.release(held.block, held.enter_ms, held.exit_ms)
-        return cancelled
+        return self.move(transaction, now, intent, State.CANCELLED)
+
+    def _activate(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
+        intent = _found(transaction, intent_id)
+        if intent.activated_ms is not None and intent.state in (State.ACTIVATED, State.NONCONFORMING):
+            return intent
+        if intent.state not in (State.ACCEPTED, State.NONCONFORMING) or intent.trajectory is None:
+            raise IllegalTransition(f"flight intent {intent_id} is {intent.state} and cannot be activated")
+        if intent.trajectory.arrival_ms < now:
+            raise IllegalTransition(
+                f"flight intent {intent_id} should have arrived at {format_time(intent.trajectory.arrival_ms)} "
+                "and cannot be activated any more"
+            )
+        # One that flew without having been activated becomes so as soon as it is seen to conform.
+        state = State.ACTIVATED if intent.state is State.ACCEPTED else intent.state
+        return transaction.change(intent, state, now, is_activated=True)
+
+
+def _found(transaction: Transaction, intent_id: str) -> FlightIntent:
+    intent = transaction.find(intent_id)
+    if intent is None:
+        raise UnknownFlightIntent(f"there is no flight intent {intent_id}")
+    return intent
+
+
+def _has_landed(transaction: Transaction, intent: FlightIntent, departure_ms: int) -> bool:
+    """Tell whether a flight's aircraft was reported on the ground after its departure, and not in the air since."""
+    aircraft = Aircraft(intent.sequence)
+    seen = transaction.newest_positions([aircraft]).get(aircraft)
+    return seen is not None and seen.airborne is False and seen.time_ms >= departure_ms
 
 
 def log_intents(report: BatchReport) -> None:
@@ -267,6 +339,9 @@ def log_intents(report: BatchReport) -> None:
             _log_intent(answer.intent, request.context)
         elif isinstance(answer, FlightIntent):
             _log_intent(answer, request.context)
+        elif isinstance(answer, Moved):
+            for intent in answer.intents:
+                _log_intent(intent, request.context)
 
 
 def _log_intent(intent: FlightIntent, context: Mapping[str, object]) -> None:

@@ -9,6 +9,15 @@ RequestError                 answered as a problem; `app.problems` maps every on
 ├── UnknownBlock             no block of those indices
 ├── IllegalTransition        the intent's state does not allow it
 ├── IdempotencyKeyReused     the key came with another body before
+├── PositionRefused          a position of a telemetry report
+│   ├── UnknownFlight        of no flight intent that there is
+│   ├── PositionInTheFuture  taken later than now
+│   ├── PositionTooOld       taken longer ago than positions are kept
+│   ├── PositionOutOfOrder   not newer than what is known
+│   ├── PositionNotFinite    not a number, or infinite
+│   ├── PositionRemote       nowhere near the airspace
+│   └── InvalidPosition      not a position
+├── TooManyPositions         more positions than a report may have
 ├── InvalidCursor            not a cursor of this list
 ├── BodyTooLarge             more bytes than allowed
 ├── MalformedRequest         not JSON, or not HTTP as it should be
@@ -62,6 +71,42 @@ class IllegalTransition(RequestError):
 
 class IdempotencyKeyReused(RequestError):
     """An Idempotency-Key came again with another body."""
+
+
+class PositionRefused(RequestError):
+    """One position of a report is refused; the others are not."""
+
+
+class UnknownFlight(PositionRefused):
+    """The position names no flight intent that there is."""
+
+
+class PositionInTheFuture(PositionRefused):
+    """The position was taken later than now."""
+
+
+class PositionTooOld(PositionRefused):
+    """The position is older than positions are kept."""
+
+
+class PositionOutOfOrder(PositionRefused):
+    """A newer position of the aircraft is known."""
+
+
+class PositionNotFinite(PositionRefused):
+    """A coordinate is not a number, or infinite."""
+
+
+class PositionRemote(PositionRefused):
+    """The position lies nowhere near the airspace."""
+
+
+class InvalidPosition(PositionRefused):
+    """Not a position."""
+
+
+class TooManyPositions(RequestError):
+    """The report has more positions than it may."""
 
 
 class InvalidCursor(RequestError):

@@ -15,7 +15,14 @@ class State(StrEnum):
     ACCEPTED = "accepted"
     REJECTED = "rejected"
     CANCELLED = "cancelled"
+    ACTIVATED = "activated"
+    NONCONFORMING = "nonconforming"
+    CONTINGENT = "contingent"
     ENDED = "ended"
+
+
+# In these a flight may be in the air, or go there.
+OPEN_STATES = (State.ACCEPTED, State.ACTIVATED, State.NONCONFORMING, State.CONTINGENT)
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,26 @@ class Reservations:
     def __len__(self) -> int:
         return len(self.block)
 
+    def until(self, end_ms: int) -> "Reservations":
+        """Return what lies before a time; what covers it ends there."""
+        keep = self.enter_ms < end_ms
+        return Reservations(self.block[keep], self.enter_ms[keep], np.minimum(self.exit_ms[keep], end_ms))
+
+    def beyond(self, end_ms: int) -> "Reservations":
+        """Return, whole, those that last longer than until a time."""
+        lasts = self.exit_ms > end_ms
+        return Reservations(self.block[lasts], self.enter_ms[lasts], self.exit_ms[lasts])
+
+
+@dataclass(frozen=True, eq=False)
+class HeldReservations:
+    """Reservations as columns, with the sequence number of the intent that holds each."""
+
+    block: IntArray
+    enter_ms: IntArray
+    exit_ms: IntArray
+    sequence: IntArray
+
 
 @dataclass(frozen=True)
 class Refusal:
@@ -84,7 +111,10 @@ class FlightIntent:
     trajectory: Trajectory | None = None
     reservations: Reservations = Reservations.none()  # noqa: RUF009 -- frozen and empty
     refusal: Refusal | None = None
+    activated_ms: int | None = None
 
-    def changed(self, version: int, state: State, reservations: Reservations) -> "FlightIntent":
+    def changed(
+        self, version: int, state: State, reservations: Reservations, activated_ms: int | None
+    ) -> "FlightIntent":
         """Return the intent after a change."""
-        return replace(self, version=version, state=state, reservations=reservations)
+        return replace(self, version=version, state=state, reservations=reservations, activated_ms=activated_ms)

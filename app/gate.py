@@ -7,6 +7,7 @@ from app import auth, problems
 from app.errors import BodyTooLarge, HostNotAllowed, MalformedRequest, RequestError
 from app.settings import Settings
 
+_TELEMETRY = "/v1/telemetry"
 # More digits than any length has.
 _LENGTH_DIGITS = 15
 
@@ -45,7 +46,8 @@ class Gate:
             raise HostNotAllowed(f"Host {header!r} is not a loopback host, and there is no authentication")
 
     async def _body(self, scope: Scope, receive: Receive) -> bytes:
-        limit = self._settings.max_body_bytes
+        settings = self._settings
+        limit = settings.max_telemetry_bytes if scope["path"] == _TELEMETRY else settings.max_body_bytes
         announced = Headers(scope=scope).get("content-length", "0")
         chunks: list[bytes] = []
         too_large = len(announced) > _LENGTH_DIGITS or (announced.isdecimal() and int(announced) > limit)

@@ -9,11 +9,22 @@ from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from fastapi_offline import FastAPIOffline
-from starlette.responses import RedirectResponse
 
 from app import problems, service
 from app.gate import Gate
-from app.routes import aircraft_types, airspace, events, flight_intents, health, metrics
+from app.routes import (
+    aircraft_types,
+    airspace,
+    console,
+    events,
+    flight_intents,
+    flights,
+    health,
+    metrics,
+    status,
+    stream,
+    telemetry,
+)
 from app.service import Service
 from app.settings import Settings
 from app.times import monotonic_ms, now_ms
@@ -66,10 +77,21 @@ def create_app(
         lifespan=lifespan,
         redoc_url=None,
     )
-    for resource in (flight_intents, aircraft_types, airspace, events, health, metrics):
+    for resource in (
+        flight_intents,
+        telemetry,
+        aircraft_types,
+        airspace,
+        status,
+        flights,
+        stream,
+        events,
+        health,
+        metrics,
+        console,
+    ):
         app.include_router(resource.router)
     app.include_router(problems.router)
-    app.add_api_route("/", _to_documentation, include_in_schema=False)
     problems.install(app)
     app.add_middleware(Gate, settings=settings)
     inner = app.build_middleware_stack
@@ -77,10 +99,6 @@ def create_app(
     app.build_middleware_stack = lambda: Tracing(inner())  # type: ignore[method-assign]
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
-
-
-async def _to_documentation() -> RedirectResponse:
-    return RedirectResponse("/docs")
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:

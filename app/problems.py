@@ -69,6 +69,30 @@ KINDS: dict[type[Exception], Kind] = {
     errors.IdempotencyKeyReused: Kind(
         "idempotency-key-reused", 422, "Idempotency key used with another body", "Use a new key for a new request."
     ),
+    errors.PositionRefused: Kind(
+        "invalid-position", 422, "Not a position", "Send what /docs shows; the other positions of the report are kept."
+    ),
+    errors.UnknownFlight: Kind(
+        "unknown-flight", 404, "Unknown flight", "Check `flight_intent_id`; report others under a `track_id`."
+    ),
+    errors.PositionInTheFuture: Kind(
+        "position-in-the-future", 422, "Position from the future", "Check the reporting system's clock."
+    ),
+    errors.PositionTooOld: Kind(
+        "position-too-old", 422, "Position too old to be kept", "Report positions within seconds."
+    ),
+    errors.PositionOutOfOrder: Kind(
+        "position-out-of-order", 409, "Not newer than what is known", "Drop it; report newer positions."
+    ),
+    errors.PositionNotFinite: Kind(
+        "position-not-finite", 422, "Position not finite", "Send finite numbers, or nothing."
+    ),
+    errors.PositionRemote: Kind(
+        "position-remote", 422, "Position nowhere near the airspace", "Report positions of this airspace only."
+    ),
+    errors.TooManyPositions: Kind(
+        "too-many-positions", 413, "Too many positions", "Split the report."
+    ),
     errors.InvalidCursor: Kind(
         "invalid-cursor", 422, "Invalid cursor", "Pass `next_cursor` as it came, or leave it out to start again."
     ),

@@ -3,6 +3,7 @@
 A service may be several processes. `prepare` does what is done once for all of them, `started` what each does.
 """
 
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -13,12 +14,15 @@ import structlog
 from fastapi import Depends, Request
 
 from app import auth
+from app.conformance import Thresholds
 from app.deconfliction import Deconfliction, OccupancyReplica, log_intents
 from app.errors import ReadOnlyServer, StartupError
 from app.ledger import Ledger, create_or_upgrade, open_ledger
 from app.ledger_probe import LedgerProbe
 from app.metrics import Metrics
+from app.monitor import Monitor
 from app.settings import Settings
+from app.telemetry import Telemetry
 from app.times import monotonic_ms
 from app.writer import Policy, Writer
 from planner.aircraft import AircraftType, merged, read_aircraft_types, shipped_aircraft_types
@@ -54,6 +58,7 @@ class Writing:
 
     writer: Writer
     deconfliction: Deconfliction
+    telemetry: Telemetry
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,9 @@ class Service:
     clock: Callable[[], int]
     metrics: Metrics
     probe: LedgerProbe
+    monitor: Monitor
+    # Set when the server goes down: streams must not hold it up.
+    closing: threading.Event
 
     @property
     def is_read_only(self) -> bool:
@@ -83,6 +91,11 @@ class Service:
     def deconfliction(self) -> Deconfliction:
         """What plans and records flights; raises `ReadOnlyServer` where nothing does."""
         return self._writing().deconfliction
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """What takes positions; raises `ReadOnlyServer` where nothing does."""
+        return self._writing().telemetry
 
     def _writing(self) -> Writing:
         if self.writing is None:
@@ -176,6 +189,15 @@ def started(
         writing = None
         if not settings.read_only:
             writing = _writing(basis, ledger, clock, elapsed_ms, metrics, on_death)
+        monitor = Monitor(
+            ledger,
+            airspace,
+            clock,
+            _thresholds(settings),
+            None if writing is None else (writing.writer, writing.deconfliction),
+        )
+        if settings.monitor_every_s:
+            monitor.start(settings.monitor_every_s)
         try:
             yield Service(
                 settings=settings,
@@ -186,10 +208,22 @@ def started(
                 clock=clock,
                 metrics=metrics,
                 probe=LedgerProbe(ledger),
+                monitor=monitor,
+                closing=threading.Event(),
             )
         finally:
+            monitor.stop()
             if writing is not None:
                 writing.writer.stop()
+
+
+def _thresholds(settings: Settings) -> Thresholds:
+    return Thresholds(
+        freshness_ms=int(settings.freshness_s * 1000),
+        tolerance_ms=int(settings.tolerance_s * 1000),
+        contingent_after_ms=int(settings.contingent_after_s * 1000),
+        projection_ms=int(settings.projection_s * 1000),
+    )
 
 
 def _writing(
@@ -207,6 +241,7 @@ def _writing(
         idempotency_ms=int(settings.idempotency_hours * 3_600_000),
         queue_limit=settings.queue_limit,
         retention_ms=None if settings.retention_days is None else int(settings.retention_days * 86_400_000),
+        positions_ms=int(settings.telemetry_hours * 3_600_000),
     )
     writer = Writer(
         ledger,
@@ -219,9 +254,17 @@ def _writing(
     )
     horizon_ms = int(settings.horizon_days * 86_400_000)
     deconfliction = Deconfliction(writer, ledger, planner, basis.performances(), horizon_ms)
+    telemetry = Telemetry(
+        ledger,
+        writer,
+        basis.airspace.grid,
+        clock,
+        ahead_ms=int(settings.tolerance_s * 1000),
+        kept_ms=policy.positions_ms,
+    )
     writer.start()
     metrics.index_loaded(len(planner.index))
-    return Writing(writer, deconfliction)
+    return Writing(writer, deconfliction, telemetry)
 
 
 async def of_request(request: Request) -> Service:

@@ -6,12 +6,15 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from app.times import Timestamp, parse_time
 from planner.cfa_star import Search
 
 # A day: no hover and no ground hold is longer.
 _LONGEST_S = 86_400.0
 # An hour: clocks of servers on one ledger differ by less.
 _SHORTEST_RETENTION_DAYS = 1 / 24
+# Even the fastest clock takes years from there to the last year that can be named.
+_LATEST_CLOCK_START_MS = parse_time("2999-12-31T23:59:59.999Z")
 
 
 class Settings(BaseSettings):
@@ -35,8 +38,24 @@ class Settings(BaseSettings):
     # Without it, nothing is ever removed.
     retention_days: Annotated[float, Field(ge=_SHORTEST_RETENTION_DAYS, le=36_500)] | None = None
 
+    # Older than this, a newest position says nothing any more.
+    freshness_s: Annotated[float, Field(gt=0, le=3_600)] = 5.0
+    # How much earlier or later than its reservations an aircraft may be.
+    tolerance_s: Annotated[float, Field(ge=0, le=3_600)] = 2.0
+    contingent_after_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 30.0
+    # How far ahead a deviating flight is looked after.
+    projection_s: Annotated[float, Field(gt=0, le=3_600)] = 60.0
+    # How often the air is looked at; 0: this process does not do it.
+    monitor_every_s: Annotated[float, Field(ge=0, le=60)] = 1.0
+    telemetry_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 1.0
+
+    # For demonstrations and tests only: a clock that is set, and may run faster than time.
+    clock_start: Annotated[Timestamp, Field(le=_LATEST_CLOCK_START_MS)] | None = None
+    clock_rate: Annotated[float, Field(gt=0, le=1_000)] = 1.0
+
     queue_limit: Annotated[int, Field(ge=1)] = 1024
     max_body_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
+    max_telemetry_bytes: Annotated[int, Field(ge=1024)] = 2 * 1024 * 1024
 
     allow_unauthenticated: bool = False
     log_format: Literal["console", "json"] = "console"

@@ -40,17 +40,18 @@ _IDLE_S, _PAUSE_S = 1.0, 0.01
 _CHECKPOINT_S = 1.0
 # How often retention looks for what has passed; and how much it removes at once, so that nobody waits long for it.
 _HOUSE_MS = 60_000
-_REMOVE_INTENTS, _REMOVE_ENTRIES, _REMOVE_ANSWERS = 32, 256, 64
+_REMOVE_INTENTS, _REMOVE_ENTRIES, _REMOVE_ANSWERS, _REMOVE_POSITIONS = 32, 256, 64, 2048
 
 
 @dataclass(frozen=True)
 class Policy:
-    """How long answers to idempotency keys are kept, and flights once they have ended (None: for ever); how long the
-    ledger is asked what became of a commit: in ms. How many requests may wait."""
+    """How long answers to idempotency keys are kept, positions, and flights once they have ended (None: for ever); how
+    long the ledger is asked what became of a commit: in ms. How many requests may wait."""
 
     idempotency_ms: int
     queue_limit: int
     retention_ms: int | None = None
+    positions_ms: int = 3_600_000
     look_up_ms: int = 10_000
 
 
@@ -513,6 +514,7 @@ class Writer:
             return 0
         with self._ledger.transaction() as transaction:
             removed = transaction.remove_answers(self.answers_kept_since(now), _REMOVE_ANSWERS)
+            removed += transaction.remove_positions(self._surely(now) - self._policy.positions_ms, _REMOVE_POSITIONS)
             if self._policy.retention_ms is not None:
                 before_ms = self._surely(now) - self._policy.retention_ms
                 removed += transaction.remove_ended(before_ms, _REMOVE_INTENTS)

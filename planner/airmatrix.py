@@ -155,18 +155,27 @@ class AirMatrix:
         ------
         OutsideAirspace
         """
-        x, y = self.project(lon, lat)
-        side, height = self.block_side_m, self.block_height_m
-        offsets = ((float(x) - self.origin_x_m) / side, (float(y) - self.origin_y_m) / side, alt_m / height)
-        if not all(0 <= offset <= count for offset, count in zip(offsets, self.dimensions, strict=True)):
+        index = int(self.blocks_at(lon, lat, alt_m)[0])
+        if index < 0:
             west, south, east, north = self.bounds
             raise OutsideAirspace(
                 f"position lon {lon:.7f}, lat {lat:.7f}, {alt_m:g} m lies outside the airspace "
                 f"(lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}, "
-                f"0 to {self.dimensions[2] * height:g} m)"
+                f"0 to {self.dimensions[2] * self.block_height_m:g} m)"
             )
-        i, j, k = (min(int(offset), count - 1) for offset, count in zip(offsets, self.dimensions, strict=True))
-        return i, j, k
+        return self.block(index)
+
+    def blocks_at(self, lon: npt.ArrayLike, lat: npt.ArrayLike, alt_m: npt.ArrayLike) -> IntArray:
+        """Return the flat indices of the blocks that contain positions, -1 outside the grid: shape (n,) each."""
+        x, y = self.project(lon, lat)
+        origin = np.array([self.origin_x_m, self.origin_y_m, 0.0])
+        lengths = np.array([self.block_side_m, self.block_side_m, self.block_height_m])
+        offsets = (np.column_stack([x, y, np.asarray(alt_m, dtype=np.float64)]) - origin) / lengths
+        counts = np.array(self.dimensions)
+        # The projection is infinite where it is undefined.
+        inside = ((offsets >= 0) & (offsets <= counts)).all(axis=1)
+        i, j, k = np.minimum(np.where(inside[:, None], offsets, 0).astype(np.int64), counts - 1).T
+        return np.where(inside, (k * counts[1] + j) * counts[0] + i, -1)
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:

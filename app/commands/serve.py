@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FrameType
 from typing import Annotated
 
 import structlog
@@ -23,7 +24,7 @@ from app.main import create_app
 from app.metrics import forget_process
 from app.service import Basis
 from app.settings import Settings
-from app.times import now_ms
+from app.times import ServerClock, format_time
 from app.workers import Workers
 from planner.errors import PlannerError
 
@@ -45,6 +46,12 @@ def serve(
     read_only: Annotated[
         bool | None, typer.Option("--read-only", help="Answer reads only, of a ledger that others write.")
     ] = None,
+    clock_start: Annotated[
+        str | None, typer.Option(help="For demonstrations: set the clock to this time, RFC 3339.")
+    ] = None,
+    clock_rate: Annotated[
+        float | None, typer.Option(help="For demonstrations: seconds of its clock a second.  [default: 1]")
+    ] = None,
 ) -> None:
     """Serve the API. Every option, and every other setting, is also an AIRMATRIX_* variable."""
     settings = Settings.given(
@@ -55,6 +62,8 @@ def serve(
         aircraft_types=aircraft_types,
         workers=workers,
         read_only=read_only,
+        clock_start=clock_start,
+        clock_rate=clock_rate,
     )
     logs.configure(settings)
     auth.check_listening(settings)
@@ -64,16 +73,23 @@ def serve(
         basis = service.prepare(settings)
         if settings.allow_unauthenticated:
             log.warning("AIRMATRIX_ALLOW_UNAUTHENTICATED: anybody who reaches this address can plan and cancel flights")
+        clock = ServerClock(settings.clock_start, settings.clock_rate)
+        if clock.simulated:
+            log.warning(
+                "SIMULATED CLOCK: no time in answers, ledger or telemetry is real; for demonstrations and tests only",
+                clock=format_time(clock()),
+                rate=clock.rate,
+            )
         announce = partial(_announce, settings, listener)
         if settings.workers == 1:
-            _work(basis, listener, announce)
+            _work(basis, clock, listener, announce)
         else:
-            _supervise(basis, listener, announce)
+            _supervise(basis, clock, listener, announce)
 
 
-def _supervise(basis: Basis, listener: socket.socket, announce: Callable[[], None]) -> None:
+def _supervise(basis: Basis, clock: ServerClock, listener: socket.socket, announce: Callable[[], None]) -> None:
     """Run workers until a signal comes."""
-    workers = Workers(basis.settings.workers, partial(_worker, basis.settings, basis.fingerprint, listener))
+    workers = Workers(basis.settings.workers, partial(_worker, basis.settings, basis.fingerprint, clock, listener))
     # In memory, where there is such a place: a full disk must not end a worker that counts something.
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
     with TemporaryDirectory(prefix="airmatrix-metrics-", dir=memory) as folder:
@@ -84,19 +100,21 @@ def _supervise(basis: Basis, listener: socket.socket, announce: Callable[[], Non
         raise typer.Exit(_INTERRUPTED)
 
 
-def _worker(settings: Settings, fingerprint: str, listener: socket.socket, ready: Callable[[], None]) -> None:
+def _worker(
+    settings: Settings, fingerprint: str, clock: ServerClock, listener: socket.socket, ready: Callable[[], None]
+) -> None:
     """Be one of several processes, which must not differ in what they know."""
     logs.configure(settings)
     structlog.configure(processors=[_name_worker, *structlog.get_config()["processors"]])
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:
-        _work(service.reread_basis(settings, fingerprint), listener, ready)
+        _work(service.reread_basis(settings, fingerprint), clock, listener, ready)
     except (StartupError, PlannerError, RequestError) as error:
         log.critical("worker cannot start", error=str(error))
         sys.exit(_REFUSED)
 
 
-def _work(basis: Basis, listener: socket.socket, ready: Callable[[], None]) -> None:
+def _work(basis: Basis, clock: ServerClock, listener: socket.socket, ready: Callable[[], None]) -> None:
     """Serve in this process until a signal comes, or the writer dies."""
     died = threading.Event()
 
@@ -106,7 +124,7 @@ def _work(basis: Basis, listener: socket.socket, ready: Callable[[], None]) -> N
 
     # uvicorn ends by raising the signal that stopped it; a clean exit still closes the ledger.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(_WRITER_DIED if died.is_set() else 0))
-    with service.started(basis, now_ms, on_death=end) as running:
+    with service.started(basis, clock, clock.elapsed_ms, on_death=end) as running:
         config = uvicorn.Config(
             create_app(basis.settings, running=running),
             access_log=False,
@@ -118,7 +136,20 @@ def _work(basis: Basis, listener: socket.socket, ready: Callable[[], None]) -> N
         gc.collect()
         gc.freeze()
         ready()
-        uvicorn.Server(config).run(sockets=[listener])
+        _Server(config, running.closing).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """Tells streams to end when it is told to: it waits for open answers."""
+
+    def __init__(self, config: uvicorn.Config, closing: threading.Event) -> None:
+        super().__init__(config)
+        self._closing = closing
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to shut down."""
+        self._closing.set()
+        super().handle_exit(sig, frame)
 
 
 def _announce(settings: Settings, listener: socket.socket) -> None:

@@ -4,8 +4,8 @@ from typing import Protocol
 
 from sqlalchemy import Connection, Engine
 
+from app.flight_intents import HeldReservations
 from app.ledger.location import Location
-from app.ledger.rows import HeldReservations
 
 
 class Database(Protocol):

@@ -1,7 +1,7 @@
 """The ledger: every read, and the transactions in which alone it is written."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
@@ -11,13 +11,14 @@ from sqlalchemy.exc import DataError, DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from app.errors import LedgerUnavailable
-from app.flight_intents import FlightIntent, Reservations, State
-from app.ledger import queries
+from app.flight_intents import FlightIntent, HeldReservations, Reservations, State
+from app.ledger import positions, queries
 from app.ledger.database import Database
 from app.ledger.queries import IdempotencyRecord, JournalEntry
-from app.ledger.rows import HeldReservations, by_intent, to_held, to_intent
+from app.ledger.rows import by_intent, to_held, to_intent
 from app.ledger.tables import counters, flight_intents, reservations
 from app.ledger.transaction import ConstraintViolated, Transaction, cause_of
+from app.surveillance import AirPicture, Reach
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
 
@@ -28,10 +29,13 @@ class CommitUncertain(Exception):
 
 @dataclass(frozen=True)
 class Removed:
-    """What retention has removed: flights that ended before a time (None: none), journal entries up to a revision."""
+    """What retention has removed: flights that ended before a time (None: none), journal entries up to a revision,
+    positions that were taken before a time (None: none).
+    """
 
     before_ms: int | None
     journal_through: int
+    positions_before_ms: int | None
 
 
 class Ledger:
@@ -118,8 +122,8 @@ class Ledger:
     def removed(self) -> Removed:
         """Return what retention has removed."""
         with self._reading() as connection:
-            row = connection.execute(select(counters.c.removed_before, counters.c.journal_removed)).one()
-        return Removed(row.removed_before or None, row.journal_removed)
+            row = connection.execute(select(counters)).one()
+        return Removed(row.removed_before or None, row.journal_removed, row.positions_removed_before or None)
 
     def find(self, intent_id: str) -> FlightIntent | None:
         """Return an intent with its reservations, None if there is none."""
@@ -169,18 +173,38 @@ class Ledger:
         intents = [to_intent(row, self._airspace, owned.pop(row.sequence, Reservations.none())) for row in rows]
         return intents, owned
 
-    def held_between(
-        self, from_ms: int, to_ms: int, block: int | None = None
-    ) -> tuple[HeldReservations, dict[int, str]]:
-        """Return the reservations that overlap [from, to), by block and enter, and the ids of their intents."""
-        query = select(reservations).where(reservations.c.enter < to_ms, reservations.c.exit > from_ms)
-        if block is None:
-            query = query.where(queries.in_the_air(from_ms, to_ms))
-        else:
-            query = query.where(reservations.c.block == block)
+    def held_between(self, from_ms: int, to_ms: int, block: int) -> tuple[HeldReservations, dict[int, str]]:
+        """Return a block's reservations that overlap [from, to), by enter, and the ids of their intents."""
         with self._reading() as connection:
-            held = to_held(connection.execute(query.order_by(reservations.c.block, reservations.c.enter)))
+            held = positions.held_in(connection, [block], from_ms, to_ms)
             return held, queries.ids_of(connection, held.sequence.tolist())
+
+    def held_in(self, blocks: IntArray, from_ms: int, to_ms: int) -> HeldReservations:
+        """Return the reservations of some blocks that overlap [from, to)."""
+        with self._reading() as connection:
+            return positions.held_in(connection, np.unique(blocks).tolist(), from_ms, to_ms)
+
+    def air_picture(self, at_ms: int, reach: Reach, *, is_past: bool, is_forecast: bool) -> AirPicture:
+        """Return what is known of the air at a time: of the past as recorded, of the future as reserved."""
+        with self._reading() as connection:
+            return positions.air_picture(
+                connection, self._airspace.grid, at_ms, reach, is_past=is_past, is_forecast=is_forecast
+            )
+
+    def unseen(self, before_ms: int, limit: int) -> int:
+        """Return how many flights, up to `limit`, should have arrived before a time and were never seen."""
+        with self._reading() as connection:
+            return len(positions.unseen(connection, before_ms, limit))
+
+    def sequences(self, intent_ids: Iterable[str]) -> dict[str, int]:
+        """Return the sequence numbers of intents by their ids, without those that there are not."""
+        with self._reading() as connection:
+            return queries.sequences_of(connection, intent_ids)
+
+    def ids(self, sequences: Iterable[int]) -> dict[int, str]:
+        """Return the ids of intents by their sequence numbers."""
+        with self._reading() as connection:
+            return queries.ids_of(connection, sequences)
 
     def use_between(self, from_ms: int, to_ms: int) -> tuple[IntArray, IntArray]:
         """Return the blocks reserved within [from, to), and for how many ms of it: two arrays (n,)."""

@@ -5,8 +5,8 @@ from typing import Any
 from sqlalchemy import Connection, Dialect, Engine, create_engine, event
 
 from app.errors import ForeignLedger, LedgerMissing
+from app.flight_intents import HeldReservations
 from app.ledger.location import Location
-from app.ledger.rows import HeldReservations
 
 # "AMTX": the first half of the keys of our advisory locks.
 _LOCKS = 0x414D5458

@@ -19,7 +19,10 @@ BOUND_AT_ONCE = 10_000
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """One line of the append-only journal. `released` (n, 3): block, enter, exit of what the change took away."""
+    """One line of the append-only journal: a flight intent's new state, or what was remarked of an aircraft and why.
+
+    `released` (n, 3): block, enter, exit of what the change took away. A track has sequence 0 and no intent id.
+    """
 
     revision: int
     time_ms: int
@@ -27,6 +30,8 @@ class JournalEntry:
     intent_id: str
     sequence: int
     released: IntArray
+    track_id: str | None = None
+    reasons: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,17 @@ def ids_of(connection: Connection, sequences: Iterable[int]) -> dict[int, str]:
     return ids
 
 
+def sequences_of(connection: Connection, intent_ids: Iterable[str]) -> dict[str, int]:
+    """Return the sequence numbers of intents by their ids, without those that there are not."""
+    sequences = {}
+    unique = sorted(set(intent_ids))
+    for start in range(0, len(unique), BOUND_AT_ONCE):
+        part = flight_intents.c.id.in_(unique[start : start + BOUND_AT_ONCE])
+        rows = connection.execute(select(flight_intents.c.id, flight_intents.c.sequence).where(part))
+        sequences.update({row.id: row.sequence for row in rows})
+    return sequences
+
+
 def journal_after(connection: Connection, revision: int, limit: int | None) -> list[JournalEntry]:
     """Return up to `limit` journal entries after a revision, oldest first."""
     query = select(journal).where(journal.c.revision > revision).order_by(journal.c.revision).limit(limit)
@@ -101,6 +117,8 @@ def journal_after(connection: Connection, revision: int, limit: int | None) -> l
             row.flight_intent_id,
             row.intent,
             np.array(json.loads(row.released or "[]"), dtype=np.int64).reshape(-1, 3),
+            row.track_id,
+            tuple(json.loads(row.reasons or "[]")),
         )
         for row in connection.execute(query)
     ]

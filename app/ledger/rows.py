@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import chain
 from typing import Any
 
@@ -11,22 +11,12 @@ import orjson
 from sqlalchemy import CursorResult, Row
 
 from app.errors import LedgerDamaged
-from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission
+from app.flight_intents import FlightIntent, HeldReservations, Position, Refusal, Reservations, State, Submission
 from planner.airmatrix import AirMatrix, IntArray
 from planner.airspace import Airspace
 from planner.path import Trajectory
 
 _ROWS_AT_ONCE = 10_000
-
-
-@dataclass(frozen=True, eq=False)
-class HeldReservations:
-    """Reservations as columns, with the sequence number of the intent that holds each."""
-
-    block: IntArray
-    enter_ms: IntArray
-    exit_ms: IntArray
-    sequence: IntArray
 
 
 def to_row(intent: FlightIntent) -> dict[str, object]:
@@ -53,6 +43,7 @@ def to_row(intent: FlightIntent) -> dict[str, object]:
         "unconstrained": None if trajectory is None else trajectory.unconstrained_ms,
         "trajectory": None if trajectory is None else _dump_trajectory(trajectory),
         "refusal": None if intent.refusal is None else json.dumps(asdict(intent.refusal)),
+        "activated": intent.activated_ms,
     }
 
 
@@ -94,6 +85,7 @@ def _parsed(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightInte
         trajectory=trajectory,
         reservations=held,
         refusal=refusal,
+        activated_ms=row.activated,
     )
 
 

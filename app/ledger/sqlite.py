@@ -10,8 +10,8 @@ import numpy as np
 from sqlalchemy import Connection, Engine, create_engine, event
 
 from app.errors import ForeignLedger, LedgerMissing, LedgerUnavailable, StartupError
+from app.flight_intents import HeldReservations
 from app.ledger.location import Location
-from app.ledger.rows import HeldReservations
 
 # "AMTX": marks a SQLite file as a ledger of ours.
 APPLICATION_ID = 0x414D5458

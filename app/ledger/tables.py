@@ -1,6 +1,6 @@
 """The ledger's tables as queries see them; `migrations` creates them, with their guards."""
 
-from sqlalchemy import BigInteger, Column, Integer, MetaData, Table, Text
+from sqlalchemy import BigInteger, Boolean, Column, Double, Integer, MetaData, Table, Text
 
 metadata = MetaData()
 
@@ -22,6 +22,7 @@ counters = Table(
     Column("longest_flight", BigInteger),
     Column("removed_before", BigInteger),
     Column("journal_removed", BigInteger),
+    Column("positions_removed_before", BigInteger),
 )
 
 # Times are ms since the epoch; `origin` and `destination` JSON objects of lon, lat, alt_m; `trajectory` a JSON list of
@@ -49,6 +50,7 @@ flight_intents = Table(
     Column("unconstrained", BigInteger),
     Column("trajectory", Text),
     Column("refusal", Text),
+    Column("activated", BigInteger),
 )
 
 reservations = Table(
@@ -60,7 +62,8 @@ reservations = Table(
     Column("intent", BigInteger),
 )
 
-# `released`: a JSON list of [block, enter, exit] that a change took away, null where it took none.
+# `released`: a JSON list of [block, enter, exit] that a change took away, null where it took none. What is remarked of
+# a track has intent 0 and no flight intent's id. `reasons`: a JSON list.
 journal = Table(
     "journal",
     metadata,
@@ -70,6 +73,8 @@ journal = Table(
     Column("intent", BigInteger),
     Column("flight_intent_id", Text),
     Column("released", Text),
+    Column("track_id", Text),
+    Column("reasons", Text),
 )
 
 idempotency_keys = Table(
@@ -81,4 +86,45 @@ idempotency_keys = Table(
     Column("intent", BigInteger),
     Column("answer", Text),
     Column("created", BigInteger),
+)
+
+# The key of these three: a flight intent's sequence number and no track, or 0 and a track.
+newest_positions = Table(
+    "newest_positions",
+    metadata,
+    Column("intent", BigInteger, primary_key=True),
+    Column("track_id", Text, primary_key=True),
+    Column("time", BigInteger),
+    Column("lon", Double),
+    Column("lat", Double),
+    Column("alt_m", Double),
+    Column("airborne", Boolean),
+    Column("implausible", Boolean),
+    Column("east_mps", Double),
+    Column("north_mps", Double),
+    Column("up_mps", Double),
+)
+
+position_history = Table(
+    "position_history",
+    metadata,
+    Column("intent", BigInteger, primary_key=True),
+    Column("track_id", Text, primary_key=True),
+    Column("time", BigInteger, primary_key=True),
+    Column("lon", Double),
+    Column("lat", Double),
+    Column("alt_m", Double),
+    Column("airborne", Boolean),
+)
+
+# What was last recorded of who does not simply conform. `reasons`: a JSON list.
+remarks = Table(
+    "remarks",
+    metadata,
+    Column("intent", BigInteger, primary_key=True),
+    Column("track_id", Text, primary_key=True),
+    Column("conformance", Text),
+    Column("reasons", Text),
+    Column("since", BigInteger),
+    Column("raised", BigInteger),
 )

@@ -4,22 +4,24 @@ Whoever opens one sees everything committed before it, so `sequence` and `revisi
 lock.
 """
 
+import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import takewhile
 from typing import Any
 
-from sqlalchemy import Connection, delete, func, insert, select, tuple_, update
+from sqlalchemy import Connection, bindparam, delete, func, insert, select, tuple_, update
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 
 from app.errors import LedgerUnavailable
-from app.flight_intents import FlightIntent, Refusal, Reservations, State, Submission
-from app.ledger import queries
+from app.flight_intents import FlightIntent, HeldReservations, Refusal, Reservations, State, Submission
+from app.ledger import positions, queries
 from app.ledger.queries import IdempotencyRecord, JournalEntry
-from app.ledger.rows import HeldReservations, columns_of, dump_columns, joined, to_held, to_row
+from app.ledger.rows import columns_of, dump_columns, joined, to_held, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
+from app.surveillance import Aircraft, Remark, Sighting
 from planner.airspace import Airspace
 from planner.path import Trajectory
 
@@ -120,19 +122,72 @@ class Transaction:
         self._new_intents[intent_id] = intent
         return intent
 
-    def release(self, intent: FlightIntent, state: State, now_ms: int, keep: bool) -> FlightIntent:
-        """Move an intent to another state; unless `keep`, delete its reservations."""
+    def change(
+        self, intent: FlightIntent, state: State, now_ms: int, *, is_free: bool = False, is_activated: bool = False
+    ) -> FlightIntent:
+        """Move an intent to another state. If it `is_free`, its reservations end now: those of the future go."""
         self.flush()
-        released = None if keep else intent.reservations
+        end_ms = now_ms + 1
+        released = intent.reservations.beyond(end_ms) if is_free else None
         if released is not None:
-            self._connection.execute(delete(reservations).where(reservations.c.intent == intent.sequence))
+            mine = reservations.c.intent == intent.sequence
+            self._connection.execute(delete(reservations).where(mine, reservations.c.enter >= end_ms))
+            cut = update(reservations).where(mine, reservations.c.exit > end_ms).values(exit=end_ms)
+            self._connection.execute(cut)
         revision = self._append(intent.sequence, intent.id, now_ms, state, released)
+        activated_ms = now_ms if is_activated and intent.activated_ms is None else intent.activated_ms
         self._connection.execute(
             update(flight_intents)
             .where(flight_intents.c.sequence == intent.sequence)
-            .values(state=state.value, version=revision)
+            .values(state=state.value, version=revision, activated=activated_ms)
         )
-        return intent.changed(revision, state, intent.reservations if keep else Reservations.none())
+        held = intent.reservations.until(end_ms) if is_free else intent.reservations
+        return intent.changed(revision, state, held, activated_ms)
+
+    def end_unseen(self, before_ms: int, limit: int, now_ms: int) -> int:
+        """End up to `limit` flights that should have arrived before a time and were never seen; return how many."""
+        self.flush()
+        passed = positions.unseen(self._connection, before_ms, limit)
+        if passed:
+            changed = [
+                {"ended": sequence, "revision": self._append(sequence, intent_id, now_ms, State.ENDED, None)}
+                for sequence, intent_id in passed
+            ]
+            self._connection.execute(
+                update(flight_intents)
+                .where(flight_intents.c.sequence == bindparam("ended"))
+                .values(state=State.ENDED.value, version=bindparam("revision")),
+                changed,
+            )
+        return len(passed)
+
+    def newest_positions(self, aircraft: Iterable[Aircraft]) -> dict[Aircraft, Sighting]:
+        """Return where some aircraft were last seen, without the blocks."""
+        return positions.newest(self._connection, aircraft)
+
+    def store_positions(self, reports: Sequence[tuple[Aircraft, Sighting]]) -> None:
+        """Write positions, each newer than those before it of the same aircraft."""
+        positions.store(self._connection, reports)
+
+    def remarks(self) -> dict[Aircraft, Remark]:
+        """Return what is recorded of aircraft that do not simply conform."""
+        return positions.remarked(self._connection)
+
+    def remark(self, changes: Mapping[Aircraft, Remark | None], now_ms: int) -> None:
+        """Record what is remarked of aircraft; None: nothing any more."""
+        self.flush()
+        ids = self.ids(aircraft.sequence for aircraft in changes if aircraft.sequence)
+        for aircraft, remark in changes.items():
+            self._append(
+                aircraft.sequence,
+                ids.get(aircraft.sequence, ""),
+                now_ms,
+                "conforming" if remark is None else remark.conformance,
+                None,
+                aircraft.track_id or None,
+                () if remark is None else remark.reasons,
+            )
+        positions.remark(self._connection, changes)
 
     def find(self, intent_id: str) -> FlightIntent | None:
         """Return an intent with its reservations, None if there is none."""
@@ -208,6 +263,7 @@ class Transaction:
         sequences = list(self._connection.execute(query).scalars())
         if sequences:
             self._connection.execute(delete(reservations).where(reservations.c.intent.in_(sequences)))
+            positions.remove_of(self._connection, sequences)
             self._connection.execute(delete(flight_intents).where(flight_intents.c.sequence.in_(sequences)))
             removed_before = max(self._counters.removed_before, before_ms)
             self._counters = replace(self._counters, removed_before=removed_before)
@@ -226,6 +282,14 @@ class Transaction:
             self.flush()
             self._connection.execute(delete(journal).where(journal.c.revision <= old[-1].revision))
         return len(old)
+
+    def remove_positions(self, before_ms: int, limit: int) -> int:
+        """Remove some `limit` positions from before a time; return how many."""
+        removed = positions.remove(self._connection, before_ms, limit)
+        if removed:
+            before_ms = max(self._counters.positions_removed_before, before_ms)
+            self._counters = replace(self._counters, positions_removed_before=before_ms)
+        return removed
 
     def newest_change(self) -> int | None:
         """Return when the newest change was recorded, None if there has been none."""
@@ -273,17 +337,28 @@ class Transaction:
         self._new_keys: list[dict[str, Any]] = []
         self._new_answers: dict[tuple[str, str], IdempotencyRecord] = {}
 
-    def _append(self, sequence: int, intent_id: str, now_ms: int, kind: State, released: Reservations | None) -> int:
+    def _append(
+        self,
+        sequence: int,
+        intent_id: str,
+        now_ms: int,
+        kind: str,
+        released: Reservations | None,
+        track_id: str | None = None,
+        reasons: Sequence[str] = (),
+    ) -> int:
         """Add a journal entry under the next revision, and return that."""
         self._counters = replace(self._counters, revision=self._counters.revision + 1)
         self._new_entries.append(
             {
                 "revision": self.revision,
                 "time": now_ms,
-                "kind": kind.value,
+                "kind": str(kind),
                 "intent": sequence,
                 "flight_intent_id": intent_id,
                 "released": None if released is None else dump_columns(*columns_of(released)),
+                "track_id": track_id,
+                "reasons": json.dumps(reasons) if reasons else None,
             }
         )
         return self.revision
@@ -298,6 +373,7 @@ class _Counters:
     longest_flight: int
     removed_before: int
     journal_removed: int
+    positions_removed_before: int
 
 
 _COUNTERS = [counters.c[field.name] for field in fields(_Counters)]

@@ -6,6 +6,7 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel
 
 from app import problems
+from app.ledger import JournalEntry
 from app.routes import paging
 from app.service import ServiceDep
 from app.times import Moment
@@ -14,13 +15,19 @@ router = APIRouter(prefix="/v1/events", tags=["events"])
 
 
 class Event(BaseModel):
-    """One change of the ledger, in the order of the changes."""
+    """One change of the ledger, in the order of the changes.
+
+    `kind` is a flight intent's new state; or how the aircraft of a flight intent or of a track conforms now, with the
+    reasons.
+    """
 
     revision: int
     time: Moment
     kind: str
-    flight_intent_id: str
-    sequence: int
+    flight_intent_id: str | None
+    sequence: int | None
+    track_id: str | None
+    reasons: list[str]
 
 
 class EventPage(BaseModel):
@@ -43,18 +50,22 @@ def list_events(
     """Return the changes after a revision, oldest first. Revisions have no gaps."""
     # One more than asked for: whether there is another page.
     entries = service.ledger.journal_after(after, limit + 1)
-    items = [
-        Event(
-            revision=entry.revision,
-            time=entry.time_ms,
-            kind=entry.kind,
-            flight_intent_id=entry.intent_id,
-            sequence=entry.sequence,
-        )
-        for entry in entries[:limit]
-    ]
+    items = [event(entry) for entry in entries[:limit]]
     return EventPage(
         items=items,
         next_cursor=str(items[-1].revision) if len(entries) > limit else None,
         removed_through=service.ledger.removed().journal_through,
+    )
+
+
+def event(entry: JournalEntry) -> Event:
+    """Return a journal entry as an event."""
+    return Event(
+        revision=entry.revision,
+        time=entry.time_ms,
+        kind=entry.kind,
+        flight_intent_id=entry.intent_id or None,
+        sequence=entry.sequence or None,
+        track_id=entry.track_id,
+        reasons=list(entry.reasons),
     )

@@ -246,6 +246,30 @@ async def cancel(service: ServiceDep, intent_id: str) -> Response:
     return _intent_response(service, await service.deconfliction.cancel(_id(intent_id)))
 
 
+@router.post(
+    "/{intent_id}/activate",
+    response_class=Response,
+    responses={200: {"model": FlightIntentAnswer}, **problems.documented(404, 409, 503)},
+    summary="Activate a flight intent",
+)
+async def activate(service: ServiceDep, intent_id: str) -> Response:
+    """Say that an accepted flight is about to depart; who flies without that is nonconforming."""
+    return _intent_response(service, await service.deconfliction.activate(_id(intent_id)))
+
+
+@router.post(
+    "/{intent_id}/end",
+    response_class=Response,
+    responses={200: {"model": FlightIntentAnswer}, **problems.documented(404, 409, 503)},
+    summary="End a flight intent",
+)
+async def end(service: ServiceDep, intent_id: str) -> Response:
+    """Say that a flight is over. Its blocks are free at once if it has not departed or was reported on the ground; else
+    it keeps them until its arrival, for an aircraft does not vanish because a record did.
+    """
+    return _intent_response(service, await service.deconfliction.end(_id(intent_id)))
+
+
 def render(grid: AirMatrix, intent: FlightIntent) -> dict[str, Any]:
     """Return an intent as JSON-ready values."""
     refusal = intent.refusal

@@ -15,8 +15,8 @@ from app.routes.airspace import (
     FeatureCollection,
     OccupancyAnswer,
     StaticAnswer,
-    StatusAnswer,
 )
+from app.routes.status import StatusAnswer
 from app.times import format_time, parse_time
 from planner.airmatrix import AirMatrix
 from tests.api.bodies import SUBMIT, intent, problem

@@ -10,14 +10,25 @@ from pydantic import BaseModel, TypeAdapter
 
 from app import problems
 from app.main import create_app
-from app.routes import aircraft_types, airspace, events, flight_intents, health
+from app.routes import aircraft_types, airspace, events, flight_intents, flights, health, status, telemetry, views
 from app.settings import Settings
 
 COMMITTED = Path(__file__).parents[2] / "openapi" / "airmatrix.json"
 DOCUMENT: dict[str, Any] = create_app(Settings()).openapi()
 MODELS: dict[str, type[BaseModel]] = {
     model.__name__: model
-    for module in (flight_intents, aircraft_types, airspace, events, health, problems)
+    for module in (
+        flight_intents,
+        aircraft_types,
+        airspace,
+        events,
+        flights,
+        health,
+        problems,
+        status,
+        telemetry,
+        views,
+    )
     for model in vars(module).values()
     if isinstance(model, type) and issubclass(model, BaseModel)
 }
@@ -65,9 +76,9 @@ def test_every_operation_has_a_summary_a_description_and_a_tag(operation: dict[s
 
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_every_error_is_documented_as_a_problem(operation: dict[str, Any]) -> None:
-    for status, answer in operation["responses"].items():
-        if status >= "400":
-            assert list(answer["content"]) == [problems.MEDIA_TYPE], status
+    for code, answer in operation["responses"].items():
+        if code >= "400":
+            assert list(answer["content"]) == [problems.MEDIA_TYPE], code
             assert answer["content"][problems.MEDIA_TYPE] == {"schema": {"$ref": "#/components/schemas/Problem"}}
 
 

@@ -285,7 +285,7 @@ def test_a_database_is_upgraded_without_showing_its_password(airmatrix: Run, led
     password = urlsplit(location).password
     outcome = airmatrix("db", "upgrade", "--ledger", location)
     assert (outcome.status, outcome.err) == (0, "")
-    assert outcome.out == f"{location.replace(str(password), '***')} has schema 0002\n"
+    assert outcome.out == f"{location.replace(str(password), '***')} has schema 0003\n"
 
 
 @on_postgresql

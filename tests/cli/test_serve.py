@@ -225,7 +225,7 @@ def test_a_ledger_can_be_brought_to_the_newest_schema_again_and_again(airmatrix:
     before = contents(ledger)
     for _ in range(2):
         outcome = airmatrix("db", "upgrade", "--ledger", ledger)
-        assert (outcome.status, outcome.out, outcome.err) == (0, f"{ledger} has schema 0002\n", "")
+        assert (outcome.status, outcome.out, outcome.err) == (0, f"{ledger} has schema 0003\n", "")
         assert contents(ledger) == before
 
 

@@ -223,7 +223,7 @@ def test_a_ledger_of_another_airspace_is_refused(airmatrix: Run, ledger: Path) -
 def test_a_ledger_of_a_newer_schema_is_refused(airmatrix: Run, ledger: Path, town_file: Path) -> None:
     with tampering(ledger) as book:
         book.execute("UPDATE alembic_version SET version_num = '9999'")
-    refusal = ("schema 9999", "newer than this program's 0002")
+    refusal = ("schema 9999", "newer than this program's 0003")
     airmatrix("verify", "--ledger", ledger, "--airspace", town_file).assert_refused(*refusal)
 
 

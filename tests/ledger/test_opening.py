@@ -23,7 +23,7 @@ def test_a_ledger_of_a_newer_schema_is_not_touched(ledger: str) -> None:
     with database(ledger) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
     before = content(ledger)
-    with pytest.raises(LedgerOutdated, match="has schema 9999, newer than this program's 0002"):
+    with pytest.raises(LedgerOutdated, match="has schema 9999, newer than this program's 0003"):
         create_or_upgrade(ledger)
     assert content(ledger) == before
 

@@ -136,7 +136,7 @@ def test_upgrading_a_ledger_at_head_changes_no_definition_and_no_row(ledgers: Le
     ledger = ledgers.vacant()
     create_or_upgrade(ledger)
     before = content(ledger)
-    assert create_or_upgrade(ledger) == "0002"
+    assert create_or_upgrade(ledger) == "0003"
     assert content(ledger) == before
 
 

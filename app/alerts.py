@@ -1,0 +1,112 @@
+"""What deviating aircraft threaten: each is projected ahead along its velocity, through the reservations of others."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.block_status import Status
+from app.conformance import Assessment, Conformance, Thresholds
+from app.flight_intents import HeldReservations
+from app.surveillance import Aircraft, Sighting
+from planner.airmatrix import AirMatrix, IntArray
+
+# Radius of the earth: a minute's flight is short enough for a sphere.
+_EARTH_M = 6_371_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Threat:
+    """A reservation of another flight that an aircraft would enter, and when it would (ms)."""
+
+    sequence: int
+    block: int
+    enter_ms: int
+    exit_ms: int
+    reach_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Alert:
+    """An aircraft that does not conform, since when, and what it threatens, soonest first."""
+
+    assessment: Assessment
+    raised_ms: int
+    threats: tuple[Threat, ...]
+
+    @property
+    def severity(self) -> Status:
+        """Red where it is violating, or will be if it goes on like this; else yellow."""
+        is_red = self.assessment.conformance is Conformance.VIOLATING or bool(self.threats)
+        return Status.RED if is_red else Status.YELLOW
+
+
+def alerts(
+    deviating: Iterable[tuple[Assessment, int]],
+    grid: AirMatrix,
+    at_ms: int,
+    thresholds: Thresholds,
+    held_in: Callable[[IntArray, int, int], HeldReservations],
+) -> list[Alert]:
+    """Return the alerts of assessments that deviate since given times, newest first.
+
+    `held_in` returns the reservations of some blocks that overlap [from, to).
+    """
+    until_ms = at_ms + thresholds.projection_ms
+    found = [
+        Alert(assessment, raised_ms, _threats(assessment, grid, at_ms, until_ms, held_in))
+        for assessment, raised_ms in deviating
+    ]
+    return sorted(found, key=lambda alert: (-alert.raised_ms, alert.assessment.aircraft))
+
+
+def _threats(
+    assessment: Assessment,
+    grid: AirMatrix,
+    at_ms: int,
+    until_ms: int,
+    held_in: Callable[[IntArray, int, int], HeldReservations],
+) -> tuple[Threat, ...]:
+    sighting = assessment.sighting
+    if sighting is None or not (assessment.is_airborne and assessment.is_fresh):
+        return ()
+    block, enter_ms, leave_ms = swept(sighting, grid, until_ms)
+    held = held_in(block, at_ms, until_ms)
+    threats = []
+    for here, begins, ends in zip(block.tolist(), enter_ms.tolist(), leave_ms.tolist(), strict=True):
+        meets = (held.block == here) & (held.enter_ms < ends) & (held.exit_ms > max(begins, at_ms))
+        for index in np.flatnonzero(meets).tolist():
+            sequence, enter = int(held.sequence[index]), int(held.enter_ms[index])
+            if Aircraft(sequence) != assessment.aircraft:
+                reach_ms = max(begins, enter, at_ms)
+                threats.append(Threat(sequence, here, enter, int(held.exit_ms[index]), reach_ms))
+    return tuple(sorted(set(threats), key=lambda threat: (threat.reach_ms, threat.sequence, threat.block)))
+
+
+def swept(sighting: Sighting, grid: AirMatrix, until_ms: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the blocks that an aircraft passes from where it was seen until a time if its velocity stays, each with
+    the ms in which it enters and leaves; (n,) each. What lies outside the grid is left out.
+    """
+    seconds = max(until_ms - sighting.time_ms, 0) / 1000
+    east, north, up = sighting.velocity or (0.0, 0.0, 0.0)
+    degrees = np.degrees(seconds / _EARTH_M)
+    lon = sighting.lon + degrees * east / np.cos(np.radians(sighting.lat))
+    lat = sighting.lat + degrees * north
+    x, y = grid.project([sighting.lon, lon], [sighting.lat, lat])
+    lengths = np.array([grid.block_side_m, grid.block_side_m, grid.block_height_m])
+    origin = np.array([grid.origin_x_m, grid.origin_y_m, 0.0])
+    begin, end = (np.column_stack([x, y, [sighting.alt_m, sighting.alt_m + up * seconds]]) - origin) / lengths
+    # Where the straight line crosses faces of blocks, as shares of its length.
+    shares = [np.array([0.0, 1.0])]
+    for start, stop in zip(begin.tolist(), end.tolist(), strict=True):
+        low, high = sorted((start, stop))
+        if high > low:
+            shares.append((np.arange(np.ceil(low), np.floor(high) + 1) - start) / (stop - start))
+    share = np.unique(np.clip(np.concatenate(shares), 0.0, 1.0))
+    middle = begin + ((share[:-1] + share[1:]) / 2)[:, None] * (end - begin)
+    cells = np.floor(middle).astype(np.int64)
+    inside = ((cells >= 0) & (cells < np.array(grid.dimensions))).all(axis=1)
+    i, j, k = cells[inside].T
+    block = (k * grid.dimensions[1] + j) * grid.dimensions[0] + i
+    times_ms = sighting.time_ms + np.round(share * seconds * 1000).astype(np.int64)
+    return block, times_ms[:-1][inside], np.maximum(times_ms[1:][inside], times_ms[:-1][inside] + 1)

@@ -1,0 +1,207 @@
+/** Everything in the air: aircraft with stems to the ground and vectors ahead, paths, outlines, and name tags. */
+
+import { element, setText } from "/console/dom.js";
+import { toScreen } from "/console/frame.js";
+import { idOf } from "/console/flights.js";
+import { Motion } from "/console/motion.js";
+import { rgba } from "/console/palette.js";
+import { Scene, segmentArray, spriteArray } from "/console/scene.js";
+import { symbolOf } from "/console/symbols.js";
+import { flightName, flightReason } from "/console/words.js";
+
+/** How far ahead a vector shows where an aircraft will be, as on a radar screen. */
+const VECTOR_S = 10;
+const REACH_PX = 16;
+const MOST_TAGS = 24;
+const TAG_PX = { width: 150, height: 40 };
+const RANK = { violating: 0, deviating: 1, lost: 2, unseen: 3 };
+
+export class Traffic {
+  scene;
+  /** The flight or track that is selected, and the one under the pointer: ids or null. */
+  selected = null;
+  hovered = null;
+  #frame;
+  #grid;
+  #motion = new Motion();
+  /** Aircraft at a moment other than the present, null while live. */
+  #planned = null;
+  #colours;
+  #tags;
+  #drawn = [];
+  #canvas;
+  #still = { path: [], reserved: [], block: [], ends: [], alarms: [] };
+
+  constructor(frame, grid, colours, tags) {
+    this.#frame = frame;
+    this.#grid = grid;
+    this.#colours = colours;
+    this.#tags = tags;
+    this.scene = new Scene(frame, colours, (matrix) => this.#compose(matrix));
+  }
+
+  /** Draw on this canvas's map. */
+  addTo(map) {
+    this.#canvas = map.getCanvas();
+    map.addLayer(this.scene);
+  }
+
+  /** Take the flights of a tick. */
+  take(flights, rate) {
+    this.#motion.take(flights, performance.now(), rate);
+  }
+
+  /** Show aircraft of another moment, `{flight, lon, lat, alt_m, heading}`, instead of the present ones; null ends that. */
+  showPlanned(aircraft) {
+    this.#planned = aircraft;
+  }
+
+  /** Whether anything moves from frame to frame. */
+  get moves() {
+    return this.#planned === null && this.#drawn.length > 0;
+  }
+
+  /** Draw in other colours from now on. */
+  setColours(colours) {
+    this.#colours = colours;
+    this.scene.setColours(colours);
+  }
+
+  /** Show a trajectory and the blocks reserved for it; empty lists hide them. A preview is dashed. */
+  showPath(trajectory, reservations, { preview = false } = {}) {
+    const colour = rgba(this.#colours.accent);
+    const points = trajectory.map((waypoint) => this.#frame.local(waypoint));
+    const [first, last] = [points.at(0), points.at(-1)];
+    this.#still.path = points.slice(1).map((to, index) => ({
+      from: points[index], to, colour, width: 4, dash: preview ? 7 : 0,
+    }));
+    for (const end of first ? [first, last] : []) {
+      this.#still.path.push({ from: [end[0], end[1], 0], to: end, colour, width: 2, dash: 3 });
+    }
+    const pale = rgba(this.#colours.accent, 0.35);
+    this.#still.reserved = reservations.flatMap(({ block }) => this.#floor(block, pale));
+    this.#setStill();
+  }
+
+  /** Draw a box around a block; null removes it. */
+  showBlock(block) {
+    this.#still.block = block === null ? [] : this.#box(block, rgba(this.#colours.accent), 3);
+    this.#setStill();
+  }
+
+  /** Draw boxes around the blocks that are not green. */
+  showAlarms(entries) {
+    this.#still.alarms = entries
+      .filter(({ status }) => status !== "green")
+      .flatMap(({ block, status }) => this.#box(block, rgba(this.#colours[status], 0.9), status === "red" ? 2.2 : 1.2));
+    this.#setStill();
+  }
+
+  /** Draw poles from the ground to the chosen origin and destination, positions or null. */
+  showEnds({ origin, destination }) {
+    const pole = (end, colour) => {
+      if (end === null) return [];
+      const top = this.#frame.local(end);
+      return [{ from: [top[0], top[1], 0], to: top, colour: rgba(colour), width: 3 }];
+    };
+    this.#still.ends = [...pole(origin, this.#colours.origin), ...pole(destination, this.#colours.destination)];
+    this.#setStill();
+  }
+
+  /** Return the flight or track drawn nearest to a point of the canvas, null where none is. */
+  at({ x, y }) {
+    const near = this.#drawn
+      .map(({ flight, screen }) => ({ flight, px: screen === null ? Infinity : Math.hypot(screen[0] - x, screen[1] - y) }))
+      .filter(({ px }) => px < REACH_PX)
+      .sort((one, other) => one.px - other.px);
+    return near[0]?.flight ?? null;
+  }
+
+  /** Return where an aircraft is drawn on the canvas, null where it is not. */
+  screenOf(id) {
+    return this.#drawn.find(({ flight }) => idOf(flight) === id)?.screen ?? null;
+  }
+
+  #compose(matrix) {
+    const aircraft = this.#planned ?? this.#motion.positions(performance.now());
+    const { clientWidth: width, clientHeight: height } = this.#canvas;
+    const sprites = [];
+    const segments = [];
+    this.#drawn = aircraft.map(({ flight, heading, ...position }) => {
+      const at = this.#frame.local(position);
+      const symbol = this.#planned ? "planned" : symbolOf(flight);
+      const marked = idOf(flight) === this.selected || idOf(flight) === this.hovered;
+      const alarmed = symbol in RANK;
+      sprites.push({ at, heading, symbol, scale: (marked ? 1.35 : 1) * (symbol === "violating" ? 1.2 : 1), alarmed });
+      const colour = alarmed ? this.#colours[symbol === "violating" ? "red" : "yellow"] : this.#colours.aircraft;
+      segments.push({ from: [at[0], at[1], 0], to: at, colour: rgba(colour, marked || alarmed ? 0.7 : 0.28), width: 1 });
+      const velocity = flight.velocity_mps;
+      if (velocity && symbol !== "grounded" && symbol !== "planned" && symbol !== "lost") {
+        const ahead = [at[0] + velocity.east * VECTOR_S, at[1] + velocity.north * VECTOR_S, at[2] + velocity.up * VECTOR_S];
+        segments.push({ from: at, to: ahead, colour: rgba(colour, marked || alarmed ? 0.9 : 0.45), width: alarmed ? 2 : 1.4 });
+      }
+      return { flight, at, symbol, screen: toScreen(matrix, at, width, height) };
+    });
+    sprites.sort((one, other) => one.alarmed - other.alarmed);
+    this.#placeTags(width, height);
+    return { sprites: spriteArray(sprites), segments: segmentArray(segments) };
+  }
+
+  /** Write names beside the aircraft that want attention, where there is room. */
+  #placeTags(width, height) {
+    const wanted = this.#drawn
+      .filter(({ flight, symbol, screen }) => screen !== null && screen[0] > 0 && screen[1] > 0 && screen[0] < width && screen[1] < height
+        && (symbol in RANK || [this.selected, this.hovered].includes(idOf(flight))))
+      .sort((one, other) => this.#rank(one) - this.#rank(other));
+    const taken = [];
+    let used = 0;
+    for (const { flight, symbol, screen } of wanted) {
+      const [x, y] = [Math.round(screen[0]) + 16, Math.round(screen[1]) - 34];
+      const covered = taken.some(([left, top]) => Math.abs(left - x) < TAG_PX.width && Math.abs(top - y) < TAG_PX.height);
+      if (covered || used === MOST_TAGS) continue;
+      taken.push([x, y]);
+      const tag = this.#tags.children[used] ?? this.#tags.appendChild(element("div", { class: "tag" }, element("b"), element("span")));
+      used += 1;
+      tag.hidden = false;
+      tag.dataset.symbol = symbol;
+      tag.style.transform = `translate(${x}px, ${y}px)`;
+      setText(tag.firstChild, flightName(flight));
+      setText(tag.lastChild, tagWords(flight));
+    }
+    for (const spare of [...this.#tags.children].slice(used)) spare.hidden = true;
+  }
+
+  #rank({ flight, symbol }) {
+    return [this.hovered, this.selected].includes(idOf(flight)) ? -1 : RANK[symbol];
+  }
+
+  #setStill() {
+    const { alarms, reserved, path, ends, block } = this.#still;
+    this.scene.setStill([...alarms, ...reserved, ...path, ...ends, ...block]);
+  }
+
+  /** Return the lines of a block's floor. */
+  #floor(block, colour, inset = 0.06) {
+    const base = block[2] * this.#grid.height + 1;
+    const ring = this.#grid.ring(block, inset).map(([lon, lat]) => this.#frame.local({ lon, lat, alt_m: base }));
+    return ring.slice(1).map((to, index) => ({ from: ring[index], to, colour, width: 1.2 }));
+  }
+
+  /** Return the twelve edges of a block. */
+  #box(block, colour, width) {
+    const [base, top] = [block[2] * this.#grid.height + 1, (block[2] + 1) * this.#grid.height - 1];
+    const ring = this.#grid.ring(block, 0.03).map(([lon, lat]) => this.#frame.local({ lon, lat, alt_m: 0 }));
+    const at = ([x, y], z) => [x, y, z];
+    return ring.slice(1).flatMap((corner, index) => [
+      { from: at(ring[index], base), to: at(corner, base), colour, width },
+      { from: at(ring[index], top), to: at(corner, top), colour, width },
+      { from: at(corner, base), to: at(corner, top), colour, width },
+    ]);
+  }
+}
+
+function tagWords(flight) {
+  const { position, velocity_mps: velocity, reasons } = flight;
+  const speed = velocity ? `${Math.hypot(velocity.east, velocity.north).toFixed(0)} m/s` : null;
+  return [position && `${Math.round(position.alt_m)} m`, speed, reasons.map(flightReason).join(", ")].filter(Boolean).join(" · ");
+}

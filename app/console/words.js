@@ -1,0 +1,99 @@
+/** What the service's slugs mean, in words for the control room. */
+
+import { clockTime } from "/console/time.js";
+
+export const STATUS_WORDS = {
+  green: "as planned",
+  yellow: "deviation",
+  red: "conflict",
+  idle: "not in use",
+};
+
+export const CONFORMANCE_WORDS = {
+  conforming: "conforming",
+  deviating: "deviating",
+  violating: "violating",
+  lost: "lost",
+  unseen: "not seen",
+};
+
+const BLOCK_REASONS = {
+  unplanned_use: "an aircraft is here, where nothing is reserved",
+  off_track: "the flight that reserved it is off its track",
+  wrong_layer: "the flight that reserved it flies in another layer",
+  early: "the flight that reserved it is early",
+  late: "the flight that reserved it is late",
+  lost: "the flight that reserved it has not been heard of lately",
+  contingent: "the flight that reserved it is in contingency",
+  not_seen: "the flight that reserved it should fly and has never been seen",
+  several_aircraft: "several aircraft are here at once",
+  reserved_by_another: "an aircraft is here, and another flight has reserved the block",
+  in_building: "an aircraft is where a building stands",
+  in_constraint: "an aircraft is in a closed volume",
+};
+
+const FLIGHT_REASONS = {
+  unplanned_use: "flies where nothing is reserved",
+  off_track: "off its track",
+  wrong_layer: "in the wrong layer",
+  early: "early",
+  late: "late",
+  lost: "not heard of lately",
+  contingent: "in contingency",
+  not_seen: "should fly, never seen",
+  several_aircraft: "shares a block with another aircraft",
+  reserved_by_another: "in a block reserved by another flight",
+  in_building: "where a building stands",
+  in_constraint: "in a closed volume",
+};
+
+const REFUSALS = {
+  outside_airspace: "A position lies outside of the airspace. Choose points and layers within its outline.",
+  origin_blocked: "A building stands in the origin's block.",
+  destination_blocked: "A building stands in the destination's block.",
+  same_block: "Origin and destination lie in the same block: there is nothing to plan.",
+  disconnected: "Buildings leave no way from the origin to the destination, whatever the traffic.",
+  no_departure_slot: "Within the departure window the origin's block is never free for long enough.",
+  no_conflict_free_path: "Within the departure window the other flights leave no way through.",
+  endurance_exceeded: "A way exists, but it takes longer than this aircraft can stay in the air.",
+};
+
+const PROBLEMS = {
+  "departure-in-the-past": "The departure window has passed. Choose a later departure.",
+  "beyond-horizon": "The departure lies further ahead than the service plans. Choose an earlier one.",
+  "aircraft-too-slow": "This aircraft is too slow for the airspace. Choose another.",
+  "queue-full": "Too many requests are waiting. Try again in a second.",
+  "ledger-unavailable": "The ledger is unavailable and nothing was recorded. Try again later.",
+  "outcome-unknown": "It is not known whether this was recorded. Look into the list of flights before you repeat it.",
+  "read-only": "This server only answers reads. Open the console of one that plans.",
+};
+
+/** Return what a reason says of a block. */
+export const blockReason = (slug) => BLOCK_REASONS[slug] ?? slug.replaceAll("_", " ");
+
+/** Return what a reason says of a flight. */
+export const flightReason = (slug) => FLIGHT_REASONS[slug] ?? slug.replaceAll("_", " ");
+
+/** Return a refusal or another failed request as `{headline, explanation, detail}`. */
+export function explained(failure) {
+  const problem = failure.problem;
+  if (problem === null) return { headline: "No answer", explanation: `Nothing is known: ${failure.message}.`, detail: "" };
+  const slug = String(problem.type).split("/").pop();
+  const explanation = REFUSALS[problem.reason] ?? PROBLEMS[slug] ?? problem.detail;
+  return {
+    headline: REFUSALS[problem.reason] ? "Refused" : problem.title,
+    explanation,
+    detail: explanation === problem.detail ? "" : problem.detail,
+  };
+}
+
+/** Return what a flight or track is called. */
+export function flightName({ reference, operator, sequence, track_id: track }) {
+  if (track) return `track ${track}`;
+  return reference ?? `${operator} #${sequence}`;
+}
+
+/** Return a journal entry in words. */
+export function journalWords({ kind, sequence, time }) {
+  return `#${sequence} ${kind} at ${clockTime(Date.parse(time))} UTC`;
+}

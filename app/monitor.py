@@ -1,0 +1,214 @@
+"""Conformance monitoring: looks at the air every second, records what changed, moves states that move by themselves."""
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+
+import structlog
+
+from app.alerts import Alert, alerts
+from app.block_status import BlockStatus, statuses
+from app.conformance import Assessment, Conformance, Thresholds, assess, move
+from app.deconfliction import Deconfliction, Moved
+from app.errors import IllegalTransition, LedgerUnavailable, QueueFull
+from app.flight_intents import State
+from app.ledger import Ledger, Transaction
+from app.surveillance import Aircraft, AirPicture, Flight, Reach, Remark
+from app.writer import Writer
+from planner.airspace import Airspace
+
+log = structlog.get_logger()
+
+# So many flights that were never seen are ended at once, so that nobody waits long for it.
+_END_AT_ONCE = 256
+# A flight is shown from so long before its departure, a track until so long after it was last seen.
+_DUE_MS, _TRACK_MS = 60_000, 60_000
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The air at one time as it was judged `now_ms`: every aircraft, and every block in use, by block."""
+
+    now_ms: int
+    picture: AirPicture
+    assessed: Mapping[Aircraft, Assessment]
+    blocks: Sequence[BlockStatus]
+
+    @property
+    def at_ms(self) -> int:
+        """The time."""
+        return self.picture.at_ms
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is to be recorded of one aircraft: what was remarked of it and what is now, and where its state goes."""
+
+    aircraft: Aircraft
+    flight: Flight | None
+    before: Remark | None
+    after: Remark | None
+    state: State | None
+
+
+class Monitor:
+    """Judges the air at any time; between `start` and `stop` it does so by itself and records what changed.
+
+    Several processes may do this on one ledger: who comes second finds nothing left to record.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        airspace: Airspace,
+        clock: Callable[[], int],
+        thresholds: Thresholds,
+        writing: tuple[Writer, Deconfliction] | None,
+    ) -> None:
+        self._ledger = ledger
+        self._airspace = airspace
+        self._clock = clock
+        self._thresholds = thresholds
+        self._writing = writing
+        self._reach = Reach(
+            before_ms=thresholds.freshness_ms + thresholds.tolerance_ms,
+            after_ms=thresholds.tolerance_ms,
+            due_ms=_DUE_MS,
+            track_ms=_TRACK_MS,
+        )
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._latest: View | None = None
+
+    def start(self, every_s: float) -> None:
+        """Begin to look, at intervals by the system's clock."""
+        self._thread = threading.Thread(target=self._run, args=(every_s,), name="conformance-monitor", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End it."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def view(self, at_ms: int | None = None) -> View:
+        """Return the air as it is, or at a time: the past from recorded positions, the future from reservations.
+
+        Raises
+        ------
+        LedgerUnavailable
+        """
+        now = self._clock()
+        at_ms = now if at_ms is None else at_ms
+        picture = self._ledger.air_picture(at_ms, self._reach, is_past=at_ms < now, is_forecast=at_ms > now)
+        assessed = assess(picture, self._airspace.grid, self._thresholds)
+        blocks, assessed = statuses(picture, assessed, self._airspace.occupied)
+        return View(now, picture, assessed, blocks)
+
+    def alerts(self, view: View) -> list[Alert]:
+        """Return who deviates in a view of the present, and whom they threaten; raises `LedgerUnavailable`."""
+        deviating = [
+            (assessment, view.at_ms if remark is None else remark.raised_ms)
+            for aircraft, assessment in view.assessed.items()
+            if assessment.reasons
+            for remark in [view.picture.remarks.get(aircraft)]
+        ]
+        return alerts(deviating, self._airspace.grid, view.at_ms, self._thresholds, self._ledger.held_in)
+
+    def status_of(self, block: int) -> BlockStatus | None:
+        """Return a block's status now, None where it is idle; raises `LedgerUnavailable`."""
+        return next((entry for entry in self.view().blocks if entry.block == block), None)
+
+    @property
+    def latest(self) -> View | None:
+        """What was seen last, None before the first look."""
+        return self._latest
+
+    def look(self) -> View:
+        """Judge the present, record what has changed, and return it as it was judged.
+
+        Raises
+        ------
+        LedgerUnavailable, QueueFull
+        """
+        view = self.view()
+        if self._writing is not None:
+            writer, deconfliction = self._writing
+            changes = self._changes(view)
+            if changes:
+                writer.enqueue(partial(_record, deconfliction, changes), lambda: Moved(())).future.result()
+            self._end_unseen(writer, view.at_ms)
+        self._latest = view
+        return view
+
+    def _run(self, every_s: float) -> None:
+        while not self._stopping.wait(every_s):
+            try:
+                self.look()
+            except (LedgerUnavailable, QueueFull) as error:
+                with suppress(OSError, ValueError):
+                    log.warning("conformance is not monitored", error=str(error))
+            except Exception as error:
+                with suppress(OSError, ValueError):
+                    log.error("conformance monitoring failed", exc_info=error)
+
+    def _changes(self, view: View) -> list[Change]:
+        remarks, now = view.picture.remarks, view.at_ms
+        changes = [
+            # Ended, or gone.
+            Change(aircraft, None, before, None, None)
+            for aircraft, before in remarks.items()
+            if aircraft not in view.assessed
+        ]
+        for aircraft, assessment in view.assessed.items():
+            before = remarks.get(aircraft)
+            after = _remark(assessment, before, now)
+            is_severe = after is not None and after.conformance in (Conformance.LOST, Conformance.VIOLATING)
+            since_ms = after.since_ms if after is not None and is_severe else None
+            state = move(assessment, since_ms, now, self._thresholds)
+            if state is State.ENDED:
+                after = None
+            if state is not None or after != before:
+                changes.append(Change(aircraft, assessment.flight, before, after, state))
+        return changes
+
+    def _end_unseen(self, writer: Writer, now: int) -> None:
+        """End the flights that should have arrived and were never seen, some at a time."""
+        before_ms = now - self._thresholds.tolerance_ms
+        while self._ledger.unseen(before_ms, 1) and not self._stopping.is_set():
+            request = writer.enqueue(
+                lambda transaction, now: transaction.end_unseen(before_ms, _END_AT_ONCE, now), lambda: 0
+            )
+            if request.future.result() < _END_AT_ONCE:
+                return
+
+
+def _remark(assessment: Assessment, before: Remark | None, now: int) -> Remark | None:
+    """Return what is to be remarked of an aircraft, None where it simply conforms."""
+    reasons = assessment.all_reasons
+    if not reasons:
+        return None
+    conformance = assessment.conformance.value
+    if before is None:
+        return Remark(conformance, reasons, now, now)
+    since_ms = before.since_ms if before.conformance == conformance else now
+    return Remark(conformance, reasons, since_ms, before.raised_ms)
+
+
+def _record(deconfliction: Deconfliction, changes: Sequence[Change], transaction: Transaction, now: int) -> Moved:
+    """Write down changes that nobody else has written down already; return the flights that moved."""
+    present = transaction.remarks()
+    current = [change for change in changes if present.get(change.aircraft) == change.before]
+    moved = []
+    for change in current:
+        intent = None if change.flight is None or change.state is None else transaction.find(change.flight.id)
+        if intent is None or change.flight is None or change.state is None or intent.version != change.flight.version:
+            continue
+        with suppress(IllegalTransition):
+            moved.append(deconfliction.move(transaction, now, intent, change.state))
+    remarked = {change.aircraft: change.after for change in current if change.after != change.before}
+    if remarked:
+        transaction.remark(remarked, now)
+    return Moved(moved)

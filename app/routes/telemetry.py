@@ -1,0 +1,191 @@
+"""Telemetry: positions of flights, and of tracks that surveillance sees."""
+
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic_core import ErrorDetails, from_json
+
+from app import problems
+from app.errors import InvalidPosition, MalformedRequest, PositionNotFinite, PositionRefused, TooManyPositions
+from app.routes.flight_intents import Label
+from app.service import ServiceDep
+from app.surveillance import Sighting
+from app.telemetry import Report
+from app.times import Timestamp
+
+router = APIRouter(prefix="/v1/telemetry", tags=["telemetry"])
+
+MAX_POSITIONS = 5_000
+
+_Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+class PositionReport(BaseModel):
+    """Where an aircraft was: of a flight intent, or of a track where only surveillance sees it."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "track_id": "radar-17",
+                    "time": "2026-11-22T08:00:00Z",
+                    "lon": 71.4210,
+                    "lat": 51.1165,
+                    "alt_m": 61.5,
+                    "airborne": True,
+                }
+            ]
+        },
+    )
+
+    flight_intent_id: UUID | None = None
+    track_id: Label | None = None
+    time: Timestamp
+    lon: Annotated[_Coordinate, Field(ge=-180, le=180)]
+    lat: Annotated[_Coordinate, Field(ge=-90, le=90)]
+    alt_m: _Coordinate
+    airborne: Annotated[bool | None, Field(strict=True)] = None
+
+    @model_validator(mode="after")
+    def _names_one(self) -> "PositionReport":
+        if (self.flight_intent_id is None) == (self.track_id is None):
+            raise ValueError("name either a flight_intent_id or a track_id")
+        return self
+
+
+class PositionProblem(BaseModel):
+    """Why one position was refused."""
+
+    index: int
+    type: str
+    title: str
+    status: int
+    detail: str
+
+
+class Flag(BaseModel):
+    """What is odd about a position that was taken."""
+
+    index: int
+    flag: Literal["implausible-jump"]
+    detail: str
+
+
+class TelemetryAnswer(BaseModel):
+    """How many positions were taken, and what is to be said of single ones."""
+
+    accepted: int
+    problems: list[PositionProblem]
+    flagged: list[Flag]
+
+
+class _Envelope(BaseModel):
+    """The body: positions, those of one aircraft in their order. Each is read, and taken or refused, for itself."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    positions: list[Any]
+
+
+_BODY_SCHEMA = {
+    "type": "object",
+    "required": ["positions"],
+    "additionalProperties": False,
+    "properties": {
+        "positions": {
+            "type": "array",
+            "maxItems": MAX_POSITIONS,
+            "description": "Those of one aircraft in their order.",
+            "items": PositionReport.model_json_schema(),
+        }
+    },
+}
+
+
+_POSITIONS = TypeAdapter(list[PositionReport])
+
+
+async def _body_of(request: Request) -> bytes:
+    return await request.body()
+
+
+@router.post(
+    "",
+    status_code=202,
+    responses=problems.documented(400, 413, 422, 503),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/json": {"schema": _BODY_SCHEMA}},
+        }
+    },
+    summary="Report positions",
+)
+def report(service: ServiceDep, body: Annotated[bytes, Depends(_body_of)]) -> TelemetryAnswer:
+    """Record where aircraft were. The answer is sent when that is durable; a report may be repeated.
+
+    Positions of the future, of another part of the world, of unknown flights or older than what is known are refused
+    one by one. One that no aircraft can have reached from the last is taken, and flagged.
+    """
+    positions, refused = _read(body)
+    receipt = service.telemetry.report([read for _, read in positions])
+    flagged = []
+    for (index, _), entry in zip(positions, receipt.entries, strict=True):
+        if isinstance(entry, PositionRefused):
+            refused[index] = entry
+        elif entry:
+            flagged.append(
+                Flag(index=index, flag="implausible-jump", detail="further from the last position than aircraft fly")
+            )
+    return TelemetryAnswer(
+        accepted=len(positions) - sum(index in refused for index, _ in positions),
+        problems=[_problem(index, refused[index]) for index in sorted(refused)],
+        flagged=flagged,
+    )
+
+
+def _read(body: bytes) -> tuple[list[tuple[int, Report]], dict[int, PositionRefused]]:
+    """Return the positions that can be read, with their indices, and what is wrong with the others."""
+    try:
+        items = _Envelope.model_validate(from_json(body)).positions
+    except ValidationError as error:
+        raise RequestValidationError([{**item, "loc": ("body", *item["loc"])} for item in error.errors()]) from error
+    except ValueError as error:
+        raise MalformedRequest(f"the body is not valid JSON: {error}") from error
+    if len(items) > MAX_POSITIONS:
+        raise TooManyPositions(f"{len(items)} positions; a report may have up to {MAX_POSITIONS}")
+    refused: dict[int, PositionRefused] = {}
+    try:
+        read = _POSITIONS.validate_python(items)
+    except ValidationError as error:
+        for item in error.errors():
+            refused.setdefault(int(item["loc"][0]), _refusal(item))
+        read = _POSITIONS.validate_python([item for index, item in enumerate(items) if index not in refused])
+    indices = [index for index in range(len(items)) if index not in refused]
+    return [(index, _report(position)) for index, position in zip(indices, read, strict=True)], refused
+
+
+def _refusal(item: ErrorDetails) -> PositionRefused:
+    field = ".".join(str(part) for part in item["loc"][1:])
+    message = item["msg"].removeprefix("Value error, ")
+    kind = PositionNotFinite if item["type"] == "finite_number" else InvalidPosition
+    return kind(f"{field}: {message}" if field else message)
+
+
+def _report(position: PositionReport) -> Report:
+    return Report(
+        Sighting(position.time, position.lon, position.lat, position.alt_m, position.airborne),
+        None if position.flight_intent_id is None else str(position.flight_intent_id),
+        position.track_id,
+    )
+
+
+def _problem(index: int, error: PositionRefused) -> PositionProblem:
+    kind = problems.kind_of(error)
+    return PositionProblem(
+        index=index, type=f"/problems/{kind.slug}", title=kind.title, status=kind.status, detail=str(error)
+    )
