@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,14 @@ from planner.airmatrix import AirMatrix, IntArray
 
 # Radius of the earth: a minute's flight is short enough for a sphere.
 _EARTH_M = 6_371_000.0
+
+
+class Way(NamedTuple):
+    """Blocks that an aircraft passes, each with the ms in which it enters and leaves; (n,) each."""
+
+    block: IntArray
+    enter_ms: IntArray
+    leave_ms: IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,42 +59,42 @@ def alerts(
 ) -> list[Alert]:
     """Return the alerts of assessments that deviate since given times, newest first.
 
-    `held_in` returns the reservations of some blocks that overlap [from, to).
+    `held_in` returns the reservations of some blocks that overlap [from, to), by block.
     """
     until_ms = at_ms + thresholds.projection_ms
-    found = [
-        Alert(assessment, raised_ms, _threats(assessment, grid, at_ms, until_ms, held_in))
-        for assessment, raised_ms in deviating
-    ]
-    return sorted(found, key=lambda alert: (-alert.raised_ms, alert.assessment.aircraft))
+    found = list(deviating)
+    ways = {
+        assessment.aircraft: swept(assessment.sighting, grid, until_ms)
+        for assessment, _ in found
+        if assessment.sighting is not None and assessment.deviates and assessment.is_airborne and assessment.is_fresh
+    }
+    threats: dict[Aircraft, tuple[Threat, ...]] = {}
+    if ways:
+        held = held_in(np.concatenate([way.block for way in ways.values()]), at_ms, until_ms)
+        threats = {aircraft: _threats(aircraft, way, held, at_ms) for aircraft, way in ways.items()}
+    raised = [Alert(assessment, raised_ms, threats.get(assessment.aircraft, ())) for assessment, raised_ms in found]
+    return sorted(raised, key=lambda alert: (-alert.raised_ms, alert.assessment.aircraft))
 
 
-def _threats(
-    assessment: Assessment,
-    grid: AirMatrix,
-    at_ms: int,
-    until_ms: int,
-    held_in: Callable[[IntArray, int, int], HeldReservations],
-) -> tuple[Threat, ...]:
-    sighting = assessment.sighting
-    if sighting is None or not (assessment.is_airborne and assessment.is_fresh):
-        return ()
-    block, enter_ms, leave_ms = swept(sighting, grid, until_ms)
-    held = held_in(block, at_ms, until_ms)
-    threats = []
-    for here, begins, ends in zip(block.tolist(), enter_ms.tolist(), leave_ms.tolist(), strict=True):
-        meets = (held.block == here) & (held.enter_ms < ends) & (held.exit_ms > max(begins, at_ms))
-        for index in np.flatnonzero(meets).tolist():
-            sequence, enter = int(held.sequence[index]), int(held.enter_ms[index])
-            if Aircraft(sequence) != assessment.aircraft:
-                reach_ms = max(begins, enter, at_ms)
-                threats.append(Threat(sequence, here, enter, int(held.exit_ms[index]), reach_ms))
-    return tuple(sorted(set(threats), key=lambda threat: (threat.reach_ms, threat.sequence, threat.block)))
+def _threats(aircraft: Aircraft, way: Way, held: HeldReservations, at_ms: int) -> tuple[Threat, ...]:
+    """Return whose reservations an aircraft would enter; `held` are by block."""
+    threats = set()
+    first = np.searchsorted(held.block, way.block, side="left").tolist()
+    last = np.searchsorted(held.block, way.block, side="right").tolist()
+    for step, (block, begins, ends) in enumerate(
+        zip(way.block.tolist(), way.enter_ms.tolist(), way.leave_ms.tolist(), strict=True)
+    ):
+        for row in range(first[step], last[step]):
+            sequence, enter, leave = int(held.sequence[row]), int(held.enter_ms[row]), int(held.exit_ms[row])
+            reach_ms = max(begins, enter, at_ms)
+            if enter < ends and leave > reach_ms and Aircraft(sequence) != aircraft:
+                threats.add(Threat(sequence, block, enter, leave, reach_ms))
+    return tuple(sorted(threats, key=lambda threat: (threat.reach_ms, threat.sequence, threat.block)))
 
 
-def swept(sighting: Sighting, grid: AirMatrix, until_ms: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the blocks that an aircraft passes from where it was seen until a time if its velocity stays, each with
-    the ms in which it enters and leaves; (n,) each. What lies outside the grid is left out.
+def swept(sighting: Sighting, grid: AirMatrix, until_ms: int) -> Way:
+    """Return the blocks that an aircraft passes from where it was seen until a time if its velocity stays; those
+    outside the grid are left out.
     """
     seconds = max(until_ms - sighting.time_ms, 0) / 1000
     east, north, up = sighting.velocity or (0.0, 0.0, 0.0)
@@ -109,4 +118,4 @@ def swept(sighting: Sighting, grid: AirMatrix, until_ms: int) -> tuple[IntArray,
     i, j, k = cells[inside].T
     block = (k * grid.dimensions[1] + j) * grid.dimensions[0] + i
     times_ms = sighting.time_ms + np.round(share * seconds * 1000).astype(np.int64)
-    return block, times_ms[:-1][inside], np.maximum(times_ms[1:][inside], times_ms[:-1][inside] + 1)
+    return Way(block, times_ms[:-1][inside], np.maximum(times_ms[1:][inside], times_ms[:-1][inside] + 1))

@@ -4,7 +4,7 @@ Red beats yellow beats green; blocks with neither reservation nor aircraft are i
 """
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -54,7 +54,7 @@ def statuses(
             present[assessment.place].append(aircraft)
     blocks, alarms = [], {}
     for block in sorted(reserved_by.keys() | present.keys()):
-        holder, here = reserved_by.get(block), present.get(block, [])
+        holder, here = reserved_by.get(block), present.get(block, ())
         red = _alarms(holder, here, is_occupied=bool(occupied[block]))
         yellow = _deviations(holder, here, assessed)
         status = Status.RED if red else Status.YELLOW if yellow else Status.GREEN
@@ -78,16 +78,18 @@ def _reserved_by(picture: AirPicture) -> dict[int, Aircraft]:
     }
 
 
-def _alarms(holder: Aircraft | None, here: list[Aircraft], *, is_occupied: bool) -> tuple[str, ...]:
+def _alarms(holder: Aircraft | None, here: Sequence[Aircraft], *, is_occupied: bool) -> tuple[str, ...]:
+    if not here:
+        return ()
     return (
         *([Alarm.SEVERAL_AIRCRAFT] if len(here) > 1 else []),
         *([Alarm.RESERVED_BY_ANOTHER] if holder is not None and any(each != holder for each in here) else []),
-        *([Alarm.IN_BUILDING] if is_occupied and here else []),
+        *([Alarm.IN_BUILDING] if is_occupied else []),
     )
 
 
 def _deviations(
-    holder: Aircraft | None, here: list[Aircraft], assessed: Mapping[Aircraft, Assessment]
+    holder: Aircraft | None, here: Sequence[Aircraft], assessed: Mapping[Aircraft, Assessment]
 ) -> tuple[str, ...]:
     if holder is None:
         return (UNPLANNED_USE,) if here else ()

@@ -1,11 +1,12 @@
 """Does each aircraft fly as it is reserved? A position is compared with the reservations at its own time. Pure."""
 
 from bisect import bisect_right
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
+
+import numpy as np
 
 from app.flight_intents import OPEN_STATES, State
 from app.surveillance import Aircraft, AirPicture, Flight, Path, Sighting
@@ -85,36 +86,38 @@ class Assessment:
 
 def assess(picture: AirPicture, grid: AirMatrix, thresholds: Thresholds) -> dict[Aircraft, Assessment]:
     """Return an assessment of each flight and track in a picture."""
-    holds = _Holds(picture, thresholds.tolerance_ms)
+    on_reservation = _on_reservation(picture, thresholds.tolerance_ms)
     assessed = {}
     for sequence, flight in picture.flights.items():
         aircraft = Aircraft(sequence)
         sighting = picture.sightings.get(aircraft)
-        assessed[aircraft] = _flight(picture, aircraft, flight, sighting, holds, grid, thresholds)
+        is_on = sequence in on_reservation
+        assessed[aircraft] = _flight(picture, aircraft, flight, sighting, grid, thresholds, is_on_reservation=is_on)
     for aircraft, sighting in picture.sightings.items():
         if aircraft.track_id:
             assessed[aircraft] = _track(picture, aircraft, sighting, thresholds)
     return assessed
 
 
-class _Holds:
-    """The reservations of a picture by flight and block."""
-
-    def __init__(self, picture: AirPicture, tolerance_ms: int) -> None:
-        self._tolerance_ms = tolerance_ms
-        self._spans: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
-        held = picture.held
-        for sequence, block, enter, leave in zip(
-            held.sequence.tolist(), held.block.tolist(), held.enter_ms.tolist(), held.exit_ms.tolist(), strict=True
-        ):
-            self._spans[sequence, block].append((enter, leave))
-
-    def cover(self, sequence: int, block: int | None, time_ms: int) -> bool:
-        """Tell whether a flight may be in a block at a time, give or take the tolerance."""
-        return block is not None and any(
-            enter - self._tolerance_ms <= time_ms < leave + self._tolerance_ms
-            for enter, leave in self._spans.get((sequence, block), ())
-        )
+def _on_reservation(picture: AirPicture, tolerance_ms: int) -> set[int]:
+    """Return the sequence numbers of the flights that were seen in a block of theirs, give or take the tolerance."""
+    seen = [
+        (aircraft.sequence, sighting.block, sighting.time_ms)
+        for aircraft, sighting in picture.sightings.items()
+        if aircraft.sequence and sighting.block is not None
+    ]
+    if not seen:
+        return set()
+    sequence, block, time_ms = np.array(sorted(seen), dtype=np.int64).T
+    held = picture.held
+    mine = np.minimum(np.searchsorted(sequence, held.sequence), len(sequence) - 1)
+    covers = (
+        (sequence[mine] == held.sequence)
+        & (block[mine] == held.block)
+        & (held.enter_ms - tolerance_ms <= time_ms[mine])
+        & (time_ms[mine] < held.exit_ms + tolerance_ms)
+    )
+    return set(held.sequence[covers].tolist())
 
 
 def _track(picture: AirPicture, aircraft: Aircraft, sighting: Sighting, thresholds: Thresholds) -> Assessment:
@@ -132,9 +135,10 @@ def _flight(
     aircraft: Aircraft,
     flight: Flight,
     sighting: Sighting | None,
-    holds: _Holds,
     grid: AirMatrix,
     thresholds: Thresholds,
+    *,
+    is_on_reservation: bool,
 ) -> Assessment:
     now, tolerance_ms, path = picture.at_ms, thresholds.tolerance_ms, flight.path
     is_due = path is not None and path.arrive_ms[0] + tolerance_ms < now and not picture.is_forecast
@@ -146,7 +150,7 @@ def _flight(
         return _on_the_ground(aircraft, flight, sighting, is_due=is_due, is_fresh=is_fresh, tolerance_ms=tolerance_ms)
     if not is_fresh:
         return Assessment(aircraft, flight, sighting, Conformance.LOST, (Reason.LOST,), is_airborne=True)
-    if path is not None and holds.cover(flight.sequence, sighting.block, sighting.time_ms):
+    if path is not None and is_on_reservation:
         reasons = (Reason.NOT_ACTIVATED,) if flight.activated_ms is None and flight.state in OPEN_STATES else ()
         place = _block_at(path, now)
         return Assessment(aircraft, flight, sighting, Conformance.CONFORMING, reasons, place, True, True)

@@ -21,8 +21,8 @@ from planner.airspace import Airspace
 
 log = structlog.get_logger()
 
-# So many flights that were never seen are ended at once, so that nobody waits long for it.
-_END_AT_ONCE = 256
+# So many changes are recorded at once, and so many flights ended that were never seen: nobody waits long for that.
+_CHANGE_AT_ONCE, _END_AT_ONCE = 64, 256
 # A flight is shown from so long before its departure, a track until so long after it was last seen.
 _DUE_MS, _TRACK_MS = 60_000, 60_000
 
@@ -137,8 +137,9 @@ class Monitor:
         if self._writing is not None:
             writer, deconfliction = self._writing
             changes = self._changes(view)
-            if changes:
-                writer.enqueue(partial(_record, deconfliction, changes), lambda: Moved(())).future.result()
+            for start in range(0, len(changes), _CHANGE_AT_ONCE):
+                part = changes[start : start + _CHANGE_AT_ONCE]
+                writer.enqueue(partial(_record, deconfliction, part), lambda: Moved(())).future.result()
             self._end_unseen(writer, view.at_ms)
         self._latest = view
         return view

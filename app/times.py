@@ -89,7 +89,7 @@ def format_times(times_ms: IntArray) -> list[str]:
 
 def format_time(time_ms: int) -> str:
     """Return one time as RFC 3339 UTC with milliseconds and Z."""
-    return format_times(np.array([time_ms], dtype=np.int64))[0]
+    return f"{(_EPOCH + timedelta(milliseconds=time_ms)).isoformat(timespec='milliseconds')[:23]}Z"
 
 
 _SERIALIZED = PlainSerializer(format_time, return_type=str)

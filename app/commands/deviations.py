@@ -43,6 +43,11 @@ class Flown:
     silent_until_ms: int | None = None
     intruder: Way | None = None
 
+    @property
+    def is_lost_for_good(self) -> bool:
+        """Tell whether its aircraft never reports its arrival."""
+        return self.silent_from_ms is not None and self.silent_until_ms is None
+
     def is_heard(self, time_ms: int) -> bool:
         """Tell whether its aircraft reports at a time."""
         if self.silent_from_ms is None or time_ms < self.silent_from_ms:

@@ -82,10 +82,6 @@ class Aircraft:
         """Where it is."""
         return self.flown.way
 
-    def reports_at(self, time_ms: int) -> bool:
-        """Tell whether anything is heard of it."""
-        return self.flown.is_heard(time_ms) and not (self.is_track and self.has_arrived(time_ms))
-
     def is_airborne(self, time_ms: int) -> bool:
         """Tell whether it flies."""
         return self.way.begin_ms <= time_ms < self.way.end_ms
@@ -222,7 +218,7 @@ class Dispatch:
             self.found.put(Aircraft(f"intruder-{intent.sequence}", crossing, crossing.way.begin_ms, is_track=True))
         if intent.state == State.ACCEPTED:
             self._plan(flown.way.begin_ms - _BEFORE_MS, self._client.activate, intent.id)
-        if flown.silent_from_ms is not None and flown.silent_until_ms is None:
+        if flown.is_lost_for_good:
             self._plan(flown.way.end_ms, self._client.end, intent.id)
 
     def _plan(self, time_ms: int, what: Callable[[str], object], id_: str) -> None:
@@ -309,7 +305,7 @@ class Pilots:
             self._flying[aircraft.id] = aircraft
             if aircraft.flown.kind is not None:
                 self.report.deviating[aircraft.flown.kind.value] += 1
-        heard = [aircraft for aircraft in self._flying.values() if aircraft.reports_at(time_ms)]
+        heard = [aircraft for aircraft in self._flying.values() if aircraft.flown.is_heard(time_ms)]
         positions = self._positions(heard, time_ms)
         told: set[str] = set()
         for start in range(0, len(heard), _BATCH):
@@ -320,7 +316,7 @@ class Pilots:
         gone = [
             aircraft
             for aircraft in self._flying.values()
-            if aircraft.has_arrived(time_ms) and (aircraft.id in told or not aircraft.reports_at(time_ms))
+            if aircraft.has_arrived(time_ms) and (aircraft.id in told or aircraft.flown.is_lost_for_good)
         ]
         for aircraft in gone:
             del self._flying[aircraft.id]

@@ -17,6 +17,7 @@ export class CityMap {
   #grid;
   #rings = new Map();
   #outline;
+  #bounds;
 
   /** Resolves when the map is drawn for the first time. */
   static async open(container, grid, bounds, buildings) {
@@ -35,16 +36,13 @@ export class CityMap {
       minZoom: 9,
       maxZoom: 20,
       style: this.#style(buildings),
-      bounds,
-      fitBoundsOptions: { padding: 24 },
-      pitch: 52,
-      bearing: -18,
       fadeDuration: 0,
     });
+    this.#bounds = bounds;
+    this.#map.jumpTo(this.#home());
     this.#map.addControl(new maplibregl.NavigationControl({ visualizePitch: true }), "top-right");
     this.#map.addControl(new maplibregl.ScaleControl({ maxWidth: 120 }), "bottom-right");
     this.#map.on("load", () => this.setTheme());
-    this.home = () => this.#map.fitBounds(bounds, { padding: 24, pitch: 52, bearing: -18 });
   }
 
   get map() {
@@ -104,13 +102,24 @@ export class CityMap {
     return nearest ? nearest.properties.key.split("/").map(Number) : null;
   }
 
+  /** Fly back to where the whole airspace is seen. */
+  goHome() {
+    this.#map.flyTo({ ...this.#home(), duration: flightMs() });
+  }
+
   /** Fly to a position, close enough to see blocks. */
   flyTo({ lon, lat }) {
     this.#map.flyTo({
       center: [lon, lat],
       zoom: Math.max(this.#map.getZoom(), 16.2),
-      duration: matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 900,
+      duration: flightMs(),
     });
+  }
+
+  /** Return the camera that sees the whole airspace. MapLibre fits bounds as if seen from above, which leaves room. */
+  #home() {
+    const above = this.#map.cameraForBounds(this.#bounds);
+    return { center: above.center, zoom: above.zoom + 0.3, pitch: 50, bearing: -18 };
   }
 
   #ring(block) {
@@ -177,6 +186,10 @@ export class CityMap {
     for (let j = 10; j < count_j; j += 10) lines.push(parts.map((part) => this.#grid.position(part * count_i, j)));
     return { type: "Feature", properties: {}, geometry: { type: "MultiLineString", coordinates: lines } };
   }
+}
+
+function flightMs() {
+  return matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 900;
 }
 
 /** Return a status's fill: plain for green, hatched one way for yellow and both ways for red. */

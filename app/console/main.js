@@ -369,7 +369,7 @@ class Console {
       ["[", "One minute earlier", () => this.#timeline.step(-60)],
       ["]", "One minute later", () => this.#timeline.step(60)],
       ["H", "Heat map", () => this.#filters.toggleHeat()],
-      ["F", "Whole airspace", () => this.#city.home()],
+      ["F", "Whole airspace", () => this.#city.goHome()],
       ["M", "Move the focus to the map", () => this.#city.map.getCanvas().focus()],
       ["T", "Dark or light", toggleTheme],
       ["?", "This list", () => byId("help-dialog").showModal()],
