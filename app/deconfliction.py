@@ -54,9 +54,9 @@ class Timing:
 
 @dataclass(frozen=True)
 class Moved:
-    """Flights that moved to other states by themselves."""
+    """Flights that moved to other states by themselves: sequence, id and new state of each."""
 
-    intents: Sequence[FlightIntent]
+    flights: Sequence[tuple[int, str, State]]
 
 
 @dataclass(frozen=True)
@@ -340,8 +340,8 @@ def log_intents(report: BatchReport) -> None:
         elif isinstance(answer, FlightIntent):
             _log_intent(answer, request.context)
         elif isinstance(answer, Moved):
-            for intent in answer.intents:
-                _log_intent(intent, request.context)
+            for sequence, intent_id, state in answer.flights:
+                log.info(f"flight intent {state}", flight_intent=intent_id, sequence=sequence)
 
 
 def _log_intent(intent: FlightIntent, context: Mapping[str, object]) -> None:

@@ -5,7 +5,7 @@ when this module is imported, and whichever is asked answers for all.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from prometheus_client import (
     CollectorRegistry,
@@ -18,8 +18,9 @@ from prometheus_client import (
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
 from app import problems
-from app.deconfliction import Outcome, PreviewPlan
-from app.flight_intents import FlightIntent, Refusal
+from app.deconfliction import Moved, Outcome, PreviewPlan
+from app.errors import PositionRefused
+from app.flight_intents import FlightIntent, Refusal, State
 from app.ledger import CommitUncertain
 from app.writer import BATCH_REQUESTS, BatchReport
 from planner.errors import NoPlan, NotPlannable
@@ -32,7 +33,18 @@ _FOLDER = os.environ.get("PROMETHEUS_MULTIPROC_DIR")
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 _SECONDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 _SIZES = [2**power for power in range(BATCH_REQUESTS.bit_length())]
-_OUTCOMES = ("accepted", "rejected", "cancelled", "replayed", "previewed")
+_OUTCOMES = ("accepted", "rejected", "cancelled", "activated", "ended", "replayed", "previewed")
+# States that a flight moves to by itself.
+_MOVES = (State.ACTIVATED, State.NONCONFORMING, State.CONTINGENT, State.ENDED)
+_ACCEPTED = "accepted"
+_POSITIONS = (
+    _ACCEPTED,
+    *(
+        problems.KINDS[kind].slug
+        for kind in (PositionRefused, *PositionRefused.__subclasses__())
+        if kind in problems.KINDS
+    ),
+)
 _COMMIT_UNCERTAIN, _BATCH_FAILED = "commit_uncertain", "batch_failed"
 _REASONS = {
     problems.KINDS[base].slug: [error.reason for error in base.__subclasses__()] for base in (NotPlannable, NoPlan)
@@ -90,6 +102,16 @@ class Metrics:
         self._plan_seconds = _seconds("plan", "Planning of a request.", registry)
         self._write_seconds = _seconds("write", "Writing the rows of a batch, before its commit.", registry)
         self._commit_seconds = _seconds("commit", "The commit of a batch.", registry)
+        self._positions = Counter(
+            "airmatrix_positions_total", "Reported positions, by what became of them.", ["outcome"], registry=registry
+        )
+        self._moves = Counter(
+            "airmatrix_state_moves_total",
+            "Flights that moved to another state by themselves, by state.",
+            ["state"],
+            registry=registry,
+        )
+        self._monitor_seconds = _seconds("monitor", "A look at all that is in the air, with what it records.", registry)
         self._ledger_failures = Counter(
             "airmatrix_ledger_failures_total", "Batches that failed, by how.", ["kind"], registry=registry
         )
@@ -97,6 +119,10 @@ class Metrics:
             self._flight_intents.labels(outcome)
         for kind in (_COMMIT_UNCERTAIN, _BATCH_FAILED):
             self._ledger_failures.labels(kind)
+        for outcome in _POSITIONS:
+            self._positions.labels(outcome)
+        for state in _MOVES:
+            self._moves.labels(state.value)
         for slug, reason in _kinds_of_problems():
             self._problems.labels(slug, reason)
 
@@ -135,9 +161,22 @@ class Metrics:
             for seconds in report.plan_s:
                 self._plan_seconds.observe(seconds)
         for answer in report.answers:
+            if isinstance(answer, Moved):
+                for _, _, state in answer.flights:
+                    self._moves.labels(state.value).inc()
             outcome = _outcome(answer)
             if outcome is not None:
                 self._flight_intents.labels(outcome).inc()
+
+    def positions(self, refused: Iterable[PositionRefused], accepted: int) -> None:
+        """Take down what became of reported positions."""
+        self._positions.labels(_ACCEPTED).inc(accepted)
+        for error in refused:
+            self._positions.labels(problems.kind_of(error).slug).inc()
+
+    def looked(self, seconds: float) -> None:
+        """Take down how long a look at the air took."""
+        self._monitor_seconds.observe(seconds)
 
     def exposition(self) -> bytes:
         """Return all metrics, those of the other workers included, in Prometheus' text format."""
@@ -172,8 +211,10 @@ def _outcome(answer: object) -> str | None:
             return "rejected"
         case Outcome():
             return "accepted"
+        case FlightIntent(state=State.CANCELLED | State.ENDED as state):
+            return state.value
         case FlightIntent():
-            return "cancelled"
+            return State.ACTIVATED.value
         case PreviewPlan() | Refusal():
             return "previewed"
         case _:

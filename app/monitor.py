@@ -1,6 +1,7 @@
 """Conformance monitoring: looks at the air every second, records what changed, moves states that move by themselves."""
 
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -54,7 +55,8 @@ class Change:
 
 
 class Monitor:
-    """Judges the air at any time; between `start` and `stop` it does so by itself and records what changed.
+    """Judges the air at any time; between `start` and `stop` it does so by itself and records what changed. `observe`
+    is told how many seconds that took.
 
     Several processes may do this on one ledger: who comes second finds nothing left to record.
     """
@@ -66,12 +68,14 @@ class Monitor:
         clock: Callable[[], int],
         thresholds: Thresholds,
         writing: tuple[Writer, Deconfliction] | None,
+        observe: Callable[[float], None] = lambda _: None,
     ) -> None:
         self._ledger = ledger
         self._airspace = airspace
         self._clock = clock
         self._thresholds = thresholds
         self._writing = writing
+        self._observe = observe
         self._reach = Reach(
             before_ms=thresholds.freshness_ms + thresholds.tolerance_ms,
             after_ms=thresholds.tolerance_ms,
@@ -133,6 +137,7 @@ class Monitor:
         ------
         LedgerUnavailable, QueueFull
         """
+        began = time.perf_counter()
         view = self.view()
         if self._writing is not None:
             writer, deconfliction = self._writing
@@ -142,6 +147,7 @@ class Monitor:
                 writer.enqueue(partial(_record, deconfliction, part), lambda: Moved(())).future.result()
             self._end_unseen(writer, view.at_ms)
         self._latest = view
+        self._observe(time.perf_counter() - began)
         return view
 
     def _run(self, every_s: float) -> None:
@@ -179,11 +185,14 @@ class Monitor:
         """End the flights that should have arrived and were never seen, some at a time."""
         before_ms = now - self._thresholds.tolerance_ms
         while self._ledger.unseen(before_ms, 1) and not self._stopping.is_set():
-            request = writer.enqueue(
-                lambda transaction, now: transaction.end_unseen(before_ms, _END_AT_ONCE, now), lambda: 0
-            )
-            if request.future.result() < _END_AT_ONCE:
+            moved = writer.enqueue(partial(_end, before_ms), lambda: Moved(())).future.result()
+            if len(moved.flights) < _END_AT_ONCE:
                 return
+
+
+def _end(before_ms: int, transaction: Transaction, now: int) -> Moved:
+    ended = transaction.end_unseen(before_ms, _END_AT_ONCE, now)
+    return Moved([(sequence, intent_id, State.ENDED) for sequence, intent_id in ended])
 
 
 def _remark(assessment: Assessment, before: Remark | None, now: int) -> Remark | None:
@@ -208,7 +217,8 @@ def _record(deconfliction: Deconfliction, changes: Sequence[Change], transaction
         if intent is None or change.flight is None or change.state is None or intent.version != change.flight.version:
             continue
         with suppress(IllegalTransition):
-            moved.append(deconfliction.move(transaction, now, intent, change.state))
+            deconfliction.move(transaction, now, intent, change.state)
+            moved.append((intent.sequence, intent.id, change.state))
     remarked = {change.aircraft: change.after for change in current if change.after != change.before}
     if remarked:
         transaction.remark(remarked, now)

@@ -195,6 +195,7 @@ def started(
             clock,
             _thresholds(settings),
             None if writing is None else (writing.writer, writing.deconfliction),
+            metrics.looked,
         )
         if settings.monitor_every_s:
             monitor.start(settings.monitor_every_s)

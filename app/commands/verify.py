@@ -46,7 +46,7 @@ def verify(
 
 def checked(intent: FlightIntent) -> CheckedFlight:
     """Return an intent as the checker sees it: with what it must hold, which is nothing if it was released wholly."""
-    released = intent.state is State.CANCELLED and len(intent.reservations) == 0
+    released = intent.state in (State.CANCELLED, State.ENDED) and len(intent.reservations) == 0
     return _flight(intent.id, intent.reservations, None if released else intent.trajectory)
 
 

@@ -128,7 +128,7 @@ export class Details {
         ["Altitude", position && `${position.alt_m.toFixed(0)} m`],
         ["Speed", velocity && `${Math.hypot(velocity.east, velocity.north).toFixed(1)} m/s, ${climb(velocity.up)}`],
         ["Block", position?.block ? `[${position.block.join(", ")}]` : null],
-        ["Last position", position === null ? "never reported" : `${span(position.age_s)} old`],
+        ["Last position", position === null ? "never reported" : `${position.age_s < 10 ? `${position.age_s.toFixed(1)} s` : span(position.age_s)} old`],
         ["Airborne", position?.airborne === true ? "yes" : position?.airborne === false ? "no, on the ground" : null],
         ["Jump", position?.flagged ? "the last position is an implausible jump" : null],
       ]));

@@ -13,7 +13,7 @@ import { flightName, flightReason } from "/console/words.js";
 const VECTOR_S = 10;
 const REACH_PX = 16;
 const MOST_TAGS = 24;
-const TAG_PX = { width: 150, height: 40 };
+const TAG_PX = { width: 170, height: 38 };
 const RANK = { violating: 0, deviating: 1, lost: 2, unseen: 3 };
 
 export class Traffic {
@@ -138,7 +138,7 @@ export class Traffic {
       const velocity = flight.velocity_mps;
       if (velocity && symbol !== "grounded" && symbol !== "planned" && symbol !== "lost") {
         const ahead = [at[0] + velocity.east * VECTOR_S, at[1] + velocity.north * VECTOR_S, at[2] + velocity.up * VECTOR_S];
-        segments.push({ from: at, to: ahead, colour: rgba(colour, marked || alarmed ? 0.9 : 0.45), width: alarmed ? 2 : 1.4 });
+        segments.push({ from: at, to: ahead, colour: rgba(colour, marked || alarmed ? 0.9 : 0.35), width: alarmed ? 2 : 1.2 });
       }
       return { flight, at, symbol, screen: toScreen(matrix, at, width, height) };
     });

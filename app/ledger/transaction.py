@@ -144,8 +144,10 @@ class Transaction:
         held = intent.reservations.until(end_ms) if is_free else intent.reservations
         return intent.changed(revision, state, held, activated_ms)
 
-    def end_unseen(self, before_ms: int, limit: int, now_ms: int) -> int:
-        """End up to `limit` flights that should have arrived before a time and were never seen; return how many."""
+    def end_unseen(self, before_ms: int, limit: int, now_ms: int) -> list[tuple[int, str]]:
+        """End up to `limit` flights that should have arrived before a time and were never seen; return sequences and
+        ids.
+        """
         self.flush()
         passed = positions.unseen(self._connection, before_ms, limit)
         if passed:
@@ -159,7 +161,7 @@ class Transaction:
                 .values(state=State.ENDED.value, version=bindparam("revision")),
                 changed,
             )
-        return len(passed)
+        return passed
 
     def newest_positions(self, aircraft: Iterable[Aircraft]) -> dict[Aircraft, Sighting]:
         """Return where some aircraft were last seen, without the blocks."""

@@ -141,8 +141,10 @@ def report(service: ServiceDep, body: Annotated[bytes, Depends(_body_of)]) -> Te
             flagged.append(
                 Flag(index=index, flag="implausible-jump", detail="further from the last position than aircraft fly")
             )
+    accepted = sum(index not in refused for index, _ in positions)
+    service.metrics.positions(refused.values(), accepted)
     return TelemetryAnswer(
-        accepted=len(positions) - sum(index in refused for index, _ in positions),
+        accepted=accepted,
         problems=[_problem(index, refused[index]) for index in sorted(refused)],
         flagged=flagged,
     )
