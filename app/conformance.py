@@ -254,7 +254,7 @@ def move(assessment: Assessment, since_ms: int | None, now_ms: int, thresholds: 
     over_ms = flight.path.depart_ms[-1] + thresholds.tolerance_ms
     if sighting is None:
         return State.ENDED if now_ms > over_ms and flight.state in (State.ACCEPTED, State.ACTIVATED) else None
-    if _has_landed(flight.path, assessment, now_ms, over_ms):
+    if _is_over(flight.path, assessment, now_ms, over_ms):
         return State.ENDED
     is_long = since_ms is not None and now_ms - since_ms >= thresholds.contingent_after_ms
     match flight.state:
@@ -269,13 +269,14 @@ def move(assessment: Assessment, since_ms: int | None, now_ms: int, thresholds: 
     return None
 
 
-def _has_landed(path: Path, assessment: Assessment, now_ms: int, over_ms: int) -> bool:
-    """Tell whether an aircraft stands at its destination: as reported, or because it was last seen there and its
-    arrival has passed.
+def _is_over(path: Path, assessment: Assessment, now_ms: int, over_ms: int) -> bool:
+    """Tell whether a flight that was seen is over: its aircraft was reported on the ground at its destination; or its
+    arrival has passed, and the aircraft is on the ground or was last seen at its destination.
     """
     sighting = assessment.sighting
-    if sighting is None or sighting.block != path.blocks[-1] or sighting.time_ms < path.arrive_ms[0]:
+    if sighting is None:
         return False
-    if sighting.airborne is False:
+    is_there = sighting.block == path.blocks[-1] and sighting.time_ms >= path.arrive_ms[0]
+    if is_there and sighting.airborne is False:
         return True
-    return now_ms > over_ms and not (assessment.is_fresh and assessment.is_airborne)
+    return now_ms > over_ms and (not assessment.is_airborne or (is_there and not assessment.is_fresh))

@@ -31,7 +31,8 @@ _FORGET_EVERY_MS = 10_000
 # A departure window may have opened before the intent came, but not longer ago than this.
 _OPEN_FOR_MS = 86_400_000
 # A process that lags further behind than this many journal entries loads the ledger afresh.
-_CATCH_UP_ENTRIES = 1_000
+_CATCH_UP_ENTRIES = 5_000
+_STATES = frozenset(State)
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,8 @@ class OccupancyReplica:
             with suppress(OSError, ValueError):
                 log.info("index loaded", revision=transaction.revision, reservations=len(held.block))
         elif transaction.revision > revision:
-            entries = transaction.journal_after(revision)
+            # What was remarked of aircraft changes no reservation.
+            entries = [entry for entry in transaction.journal_after(revision) if entry.kind in _STATES]
             for entry in entries:
                 index.release(*entry.released.T.copy())
             held = transaction.held_after(now, sorted({entry.sequence for entry in entries}))

@@ -118,8 +118,8 @@ export class CityMap {
 
   /** Return the camera that sees the whole airspace. MapLibre fits bounds as if seen from above, which leaves room. */
   #home() {
-    const above = this.#map.cameraForBounds(this.#bounds);
-    return { center: above.center, zoom: above.zoom + 0.18, pitch: 50, bearing: -18 };
+    const above = this.#map.cameraForBounds(this.#bounds, { bearing: -18 });
+    return { center: above.center, zoom: above.zoom + 0.35, pitch: 50, bearing: -18 };
   }
 
   #ring(block) {

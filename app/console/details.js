@@ -5,7 +5,7 @@ import { element, facts, navigable, statusChip } from "/console/dom.js";
 import { keyOf } from "/console/grid.js";
 import { symbolCanvas, symbolOf } from "/console/symbols.js";
 import { clockTime, relative, span } from "/console/time.js";
-import { CONFORMANCE_WORDS, STATUS_WORDS, blockReason, flightName, flightReason } from "/console/words.js";
+import { CONFORMANCE_WORDS, STATUS_WORDS, blockReason, flightName, flightReason, standing } from "/console/words.js";
 
 const HINT = "Click a block, an aircraft or an alert to see its status, the reasons for it, its path and its reservations.";
 const SHOWN = 60;
@@ -117,12 +117,13 @@ export class Details {
     }
     title.textContent = flightName(flight);
     const { position, velocity_mps: velocity } = flight;
+    const stands = standing(flight);
     const reasons = element("ul", { class: "reasons" },
       ...flight.reasons.map((slug) => element("li", { "data-reason": slug, text: flightReason(slug) })));
     place.replaceChildren(
-      element("p", { class: "conformance", "data-conformance": flight.conformance },
-        symbolCanvas(symbolOf(flight), this.#colours, 26), element("strong", { text: CONFORMANCE_WORDS[flight.conformance] }),
-        flight.since && flight.conformance !== "conforming" ? ` since ${clockTime(Date.parse(flight.since))} UTC` : ""),
+      element("p", { class: "conformance", "data-conformance": stands },
+        symbolCanvas(symbolOf(flight), this.#colours, 26), element("strong", { text: CONFORMANCE_WORDS[stands] }),
+        flight.since && !["conforming", "scheduled"].includes(stands) ? ` since ${clockTime(Date.parse(flight.since))} UTC` : ""),
       reasons,
       facts([
         ["Altitude", position && `${position.alt_m.toFixed(0)} m`],

@@ -2,9 +2,9 @@
 
 import { element, navigable, setText, showList } from "/console/dom.js";
 import { symbolCanvas, symbolOf } from "/console/symbols.js";
-import { CONFORMANCE_WORDS, flightName, flightReason } from "/console/words.js";
+import { CONFORMANCE_WORDS, flightName, flightReason, standing } from "/console/words.js";
 
-const ORDER = ["violating", "deviating", "lost", "unseen", "conforming"];
+const ORDER = ["violating", "deviating", "lost", "unseen", "conforming", "scheduled"];
 const SHOWN = 150;
 
 export class FlightsPanel {
@@ -49,7 +49,7 @@ export class FlightsPanel {
   #isFound(flight) {
     const words = this.#search.value.trim().toLowerCase();
     const conformance = this.#conformance.value;
-    if (conformance && flight.conformance !== conformance) return false;
+    if (conformance && standing(flight) !== conformance) return false;
     const text = [flight.operator, flight.reference, flight.sequence && `#${flight.sequence}`, flight.track_id, flight.aircraft_type];
     return words === "" || text.filter(Boolean).join(" ").toLowerCase().includes(words);
   }
@@ -74,8 +74,8 @@ export class FlightsPanel {
     }
     setText(name, flightName(flight));
     const { position } = flight;
-    setText(altitude, position === null ? "no position" : position.airborne === false ? "on the ground" : `${Math.round(position.alt_m)} m`);
-    const state = flight.reasons.length ? flight.reasons.map(flightReason).join(", ") : CONFORMANCE_WORDS[flight.conformance];
+    setText(altitude, position === null ? "" : position.airborne === false ? "on the ground" : `${Math.round(position.alt_m)} m`);
+    const state = flight.reasons.length ? flight.reasons.map(flightReason).join(", ") : CONFORMANCE_WORDS[standing(flight)];
     setText(message, [state, flight.track_id ? null : flight.operator, flight.sequence && `#${flight.sequence}`, flight.aircraft_type]
       .filter(Boolean).join(" · "));
   }
@@ -85,7 +85,7 @@ export class FlightsPanel {
 export const idOf = (flight) => flight.flight_intent_id ?? flight.track_id;
 
 function byUrgency(one, other) {
-  return ORDER.indexOf(one.conformance) - ORDER.indexOf(other.conformance)
+  return ORDER.indexOf(standing(one)) - ORDER.indexOf(standing(other))
     || (one.sequence ?? 0) - (other.sequence ?? 0)
     || (idOf(one) < idOf(other) ? -1 : 1);
 }

@@ -60,6 +60,7 @@ class Console {
     this.#traffic.addTo(this.#city.map);
     this.#addPanels();
     this.#addLegend();
+    byId("legend").open = innerWidth >= 1200;
     this.#listenToMap();
     this.#listenToKeys();
     this.#listenToPicture();

@@ -22,7 +22,7 @@ export class NewFlight {
     for (const end of ENDS) {
       const layer = byId(`${end}-layer`);
       for (let k = 0; k < grid.dimensions[2]; k += 1) {
-        layer.append(element("option", { value: k, text: `${grid.altitude(k)} m (${grid.layerName(k)})` }));
+        layer.append(element("option", { value: k, text: `${grid.altitude(k)} m` }));
       }
       layer.addEventListener("change", () => this.#take(end, this.ends[end]));
       byId(`pick-${end}`).addEventListener("click", () => this.pick(this.picking === end ? null : end));

@@ -1,14 +1,16 @@
 /** The aircraft's symbols: a shape for every conformance, drawn the same on the map and in the lists. */
 
+import { standing } from "/console/words.js";
+
 /** In the order of the atlas. */
-export const SYMBOLS = ["conforming", "deviating", "violating", "lost", "unseen", "grounded", "planned"];
+export const SYMBOLS = ["conforming", "deviating", "violating", "lost", "unseen", "grounded", "scheduled", "planned"];
 
 const DART = [[0, -0.62], [0.42, 0.55], [0, 0.3], [-0.42, 0.55]];
 
 /** Return which symbol a flight or track gets. */
-export function symbolOf({ conformance, position }) {
-  if (conformance === "conforming" && position?.airborne === false) return "grounded";
-  return conformance;
+export function symbolOf(flight) {
+  const stands = standing(flight);
+  return stands === "conforming" && flight.position?.airborne === false ? "grounded" : stands;
 }
 
 /** Draw a symbol into a square of `size` pixels whose corner is at (x, y); it points up. */
@@ -63,6 +65,10 @@ const PAINTERS = {
     disc(context, 0.34, yellow, null, 0.16);
   },
   grounded: (context, { aircraft, outline }) => disc(context, 0.26, outline, aircraft, 0.14),
+  scheduled: (context, { aircraft, outline }) => {
+    disc(context, 0.26, outline, null, 0.26);
+    disc(context, 0.26, aircraft, null, 0.12);
+  },
   planned: (context, { accent, outline }) => hollowDart(context, accent, outline, 1),
 };
 

@@ -15,7 +15,11 @@ export const CONFORMANCE_WORDS = {
   violating: "violating",
   lost: "lost",
   unseen: "not seen",
+  scheduled: "not departed yet",
 };
+
+/** What the service calls unseen although it need not be seen yet. */
+const SCHEDULED = "scheduled";
 
 const BLOCK_REASONS = {
   unplanned_use: "an aircraft is here, where nothing is reserved",
@@ -30,6 +34,7 @@ const BLOCK_REASONS = {
   reserved_by_another: "an aircraft is here, and another flight has reserved the block",
   in_building: "an aircraft is where a building stands",
   in_constraint: "an aircraft is in a closed volume",
+  not_accepted: "an aircraft flies here without an accepted plan",
 };
 
 const FLIGHT_REASONS = {
@@ -45,6 +50,9 @@ const FLIGHT_REASONS = {
   reserved_by_another: "in a block reserved by another flight",
   in_building: "where a building stands",
   in_constraint: "in a closed volume",
+  not_activated: "flies without having been activated",
+  not_accepted: "flies without an accepted plan",
+  no_flight_intent: "no flight intent belongs to it",
 };
 
 const REFUSALS = {
@@ -85,6 +93,11 @@ export function explained(failure) {
     explanation,
     detail: explanation === problem.detail ? "" : problem.detail,
   };
+}
+
+/** Return how a flight keeps to its plan, for lists and symbols: its conformance, or `scheduled` before its departure. */
+export function standing({ conformance, reasons }) {
+  return conformance === "unseen" && reasons.length === 0 ? SCHEDULED : conformance;
 }
 
 /** Return what a flight or track is called. */

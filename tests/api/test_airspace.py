@@ -27,6 +27,7 @@ from tests.ledger.process import FakeClock
 
 STATUS = "/v1/airspace/status"
 OCCUPANCY = "/v1/airspace/occupancy"
+CLOCK = {"now": "2026-11-22T08:00:00.000Z", "rate": 1.0, "simulated": False}
 LINK_MS = 1668
 ARRIVAL_MS = DEPARTURE_MS + 7 * LINK_MS
 
@@ -71,6 +72,7 @@ def test_the_airspace_says_exactly_what_it_is(client: Client) -> None:
         "crs": "EPSG:32642",
         "bounds": list(grid.bounds),
         "origin": {"x": 668_920.0, "y": 5_665_220.0, "lon": lon, "lat": lat},
+        "lattice": [[[round(degrees, 10) for degrees in corner(grid, i, j)] for i in (0, 4, 8)] for j in (0, 2.5, 5)],
         "block_side_m": 20.0,
         "block_height_m": 40.0,
         "dimensions": [8, 5, 2],
@@ -168,9 +170,14 @@ def test_status_names_the_blocks_in_use_and_by_whom(flown: Client) -> None:
     flight = the_flight(flown)
     assert answer == {
         "at": format_time(DEPARTURE_MS + LINK_MS + 1),
+        "clock": CLOCK,
         "removed_before": None,
+        "positions_removed_before": None,
         "counts": {"green": 2, "yellow": 0, "red": 0},
-        "blocks": [{"block": [i, 0, 0], "status": "green", "reasons": [], "flight_intents": [flight]} for i in (1, 2)],
+        "blocks": [
+            {"block": [i, 0, 0], "status": "green", "reasons": [], "flight_intents": [flight], "track_ids": []}
+            for i in (1, 2)
+        ],
     }
     StatusAnswer.model_validate(answer)
 
@@ -192,7 +199,9 @@ def test_status_is_exact_to_the_millisecond(flown: Client, time_ms: int, columns
 def test_status_is_of_now_by_default(flown: Client, clock: FakeClock) -> None:
     assert flown.get(STATUS).json() == {
         "at": "2026-11-22T08:00:00.000Z",
+        "clock": CLOCK,
         "removed_before": None,
+        "positions_removed_before": None,
         "counts": {"green": 0, "yellow": 0, "red": 0},
         "blocks": [],
     }
@@ -305,7 +314,10 @@ def test_status_as_geojson_has_footprints_and_heights(client: Client) -> None:
     response = client.get(STATUS, **at(DEPARTURE_MS, f="geojson"))
     answer = response.json()
     assert response.headers["content-type"] == "application/geo+json"
-    assert set(answer) == {"type", "at", "removed_before", "features"}
+    assert set(answer) == {
+        "type", "at", "clock", "removed_before", "positions_removed_before", "counts", "features",
+    }  # fmt: skip
+    assert answer["counts"] == {"green": 2, "yellow": 0, "red": 0}
     FeatureCollection.model_validate(answer)
     upper = answer["features"][1]
     assert set(upper) == {"type", "geometry", "properties"}
@@ -315,6 +327,7 @@ def test_status_as_geojson_has_footprints_and_heights(client: Client) -> None:
         "status": "green",
         "reasons": [],
         "flight_intents": [flight],
+        "track_ids": [],
         "base_m": 40.0,
         "height_m": 40.0,
     }

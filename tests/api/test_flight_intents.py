@@ -463,7 +463,7 @@ def test_a_cursor_of_somebody_elses_making_is_refused(listed: Client, cursor: st
         {"limit": "501"},
         {"limit": "-1"},
         {"limit": "many"},
-        {"state": "activated"},
+        {"state": "landed"},
         {"from": "yesterday"},
         {"from": "2026-11-22T08:00:00"},
         {"to": "1795334400000"},

@@ -12,15 +12,20 @@ from tests.ledger.locations import REFUSED, Ledgers, Stranger, content, database
 from tests.ledger.process import Hold
 
 TABLES = {
-    "airspace", "alembic_version", "counters", "flight_intents", "idempotency_keys", "journal", "reservations",
+    "airspace", "alembic_version", "counters", "flight_intents", "idempotency_keys", "journal", "newest_positions",
+    "position_history", "remarks", "reservations",
 }  # fmt: skip
 INDICES = {
     "flight_intents_by_operator",
     "flight_intents_by_time",
     "flight_intents_by_end",
+    "flight_intents_open",
     "reservations_by_intent",
     "idempotency_keys_by_age",
     "idempotency_keys_by_intent",
+    "journal_by_intent",
+    "newest_positions_by_time",
+    "position_history_by_time",
 }
 CONSTRAINTS = {
     "airspace": {"airspace_only_one"},
@@ -29,6 +34,9 @@ CONSTRAINTS = {
     "reservations": {"reservations_not_empty", "reservations_intent"},
     "journal": set[str](),
     "idempotency_keys": {"idempotency_keys_intent"},
+    "newest_positions": set[str](),
+    "position_history": set[str](),
+    "remarks": set[str](),
 }
 # What holds reservations apart, and the journal as it is: SQLite has no exclusion constraints, and no TRUNCATE.
 SQLITE_TRIGGERS = {
@@ -271,14 +279,14 @@ def test_of_two_strangers_who_reserve_a_block_at_once_the_second_is_refused(ledg
     assert holds(migrated) == {(7, 10, 20)}
 
 
-ENTRY = (1, 5, "accepted", 1, "one", None)
+ENTRY = (1, 5, "accepted", 1, "one", None, None, None)
 
 
 @pytest.mark.parametrize(
     "statement", ["UPDATE journal SET kind = 'rejected'", "DELETE FROM journal"], ids=["update", "delete"]
 )
 def test_what_stands_in_the_journal_cannot_be_changed(statement: str, migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?)", ENTRY)
+    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?, ?, ?)", ENTRY)
     with pytest.raises(REFUSED, match="journal_append_only"):
         migrated.execute(statement)
     assert migrated.rows("SELECT * FROM journal") == [ENTRY]
@@ -286,9 +294,9 @@ def test_what_stands_in_the_journal_cannot_be_changed(statement: str, migrated: 
 
 @on_sqlite
 def test_what_stands_in_the_journal_cannot_be_replaced(migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?)", ENTRY)
+    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?, ?, ?)", ENTRY)
     with pytest.raises(REFUSED, match="journal_in_order"):
-        migrated.execute("INSERT OR REPLACE INTO journal VALUES (1, 5, 'rejected', 1, 'one', NULL)")
+        migrated.execute("INSERT OR REPLACE INTO journal VALUES (1, 5, 'rejected', 1, 'one', NULL, NULL, NULL)")
     assert migrated.rows("SELECT * FROM journal") == [ENTRY]
 
 
@@ -298,7 +306,7 @@ def test_what_stands_in_the_journal_cannot_be_replaced(migrated: Stranger) -> No
     [
         ("TRUNCATE journal", "journal_append_only"),
         (
-            "INSERT INTO journal VALUES (1, 5, 'rejected', 1, 'one', NULL) "
+            "INSERT INTO journal VALUES (1, 5, 'rejected', 1, 'one', NULL, NULL, NULL) "
             "ON CONFLICT (revision) DO UPDATE SET kind = 'rejected'",
             "journal_in_order",
         ),
@@ -306,21 +314,21 @@ def test_what_stands_in_the_journal_cannot_be_replaced(migrated: Stranger) -> No
     ids=["truncate", "upsert"],
 )
 def test_the_journal_can_be_neither_emptied_nor_overwritten(statement: str, guard: str, migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?)", ENTRY)
+    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?, ?, ?)", ENTRY)
     with pytest.raises(REFUSED, match=guard):
         migrated.execute(statement)
     assert migrated.rows("SELECT * FROM journal") == [ENTRY]
 
 
 def test_nothing_is_added_behind_the_newest_entry_of_the_journal(migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (3, 5, 'accepted', 1, 'one', NULL)")
+    migrated.execute("INSERT INTO journal VALUES (3, 5, 'accepted', 1, 'one', NULL, NULL, NULL)")
     with pytest.raises(REFUSED, match="journal_in_order"):
-        migrated.execute("INSERT INTO journal VALUES (2, 5, 'cancelled', 1, 'one', NULL)")
+        migrated.execute("INSERT INTO journal VALUES (2, 5, 'cancelled', 1, 'one', NULL, NULL, NULL)")
 
 
 def test_the_journal_gives_up_what_the_ledger_says_has_been_removed_and_nothing_newer(migrated: Stranger) -> None:
     for revision in (1, 2, 3):
-        migrated.execute("INSERT INTO journal VALUES (?, 5, 'accepted', 1, 'one', NULL)", [revision])
+        migrated.execute("INSERT INTO journal VALUES (?, 5, 'accepted', 1, 'one', NULL, NULL, NULL)", [revision])
     migrated.execute("UPDATE counters SET journal_removed = 2")
     migrated.execute("DELETE FROM journal WHERE revision <= 2")
     with pytest.raises(REFUSED, match="journal_append_only"):
