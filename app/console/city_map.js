@@ -118,8 +118,9 @@ export class CityMap {
 
   /** Return the camera that sees the whole airspace. MapLibre fits bounds as if seen from above, which leaves room. */
   #home() {
-    const above = this.#map.cameraForBounds(this.#bounds, { bearing: -18 });
-    return { center: above.center, zoom: above.zoom + 0.35, pitch: 50, bearing: -18 };
+    // Room for the cards at the left.
+    const above = this.#map.cameraForBounds(this.#bounds, { padding: { left: 110, top: 0, right: 0, bottom: 0 } });
+    return { center: above.center, zoom: above.zoom + 0.2, pitch: 50, bearing: -14 };
   }
 
   #ring(block) {
