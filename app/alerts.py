@@ -87,7 +87,7 @@ def _threats(aircraft: Aircraft, way: Way, held: HeldReservations, at_ms: int) -
         for row in range(first[step], last[step]):
             sequence, enter, leave = int(held.sequence[row]), int(held.enter_ms[row]), int(held.exit_ms[row])
             reach_ms = max(begins, enter, at_ms)
-            if enter < ends and leave > reach_ms and Aircraft(sequence) != aircraft:
+            if max(enter, at_ms) < ends and leave > reach_ms and Aircraft(sequence) != aircraft:
                 threats.add(Threat(sequence, block, enter, leave, reach_ms))
     return tuple(sorted(threats, key=lambda threat: (threat.reach_ms, threat.sequence, threat.block)))
 
@@ -113,9 +113,10 @@ def swept(sighting: Sighting, grid: AirMatrix, until_ms: int) -> Way:
             shares.append((np.arange(np.ceil(low), np.floor(high) + 1) - start) / (stop - start))
     share = np.unique(np.clip(np.concatenate(shares), 0.0, 1.0))
     middle = begin + ((share[:-1] + share[1:]) / 2)[:, None] * (end - begin)
-    cells = np.floor(middle).astype(np.int64)
-    inside = ((cells >= 0) & (cells < np.array(grid.dimensions))).all(axis=1)
-    i, j, k = cells[inside].T
+    # As where positions lie: the grid's upper faces belong to its last blocks.
+    last = np.array(grid.dimensions) - 1
+    inside = ((middle >= 0) & (middle <= last + 1)).all(axis=1)
+    i, j, k = np.minimum(np.floor(middle[inside]), last).astype(np.int64).T
     block = (k * grid.dimensions[1] + j) * grid.dimensions[0] + i
     times_ms = sighting.time_ms + np.round(share * seconds * 1000).astype(np.int64)
     return Way(block, times_ms[:-1][inside], np.maximum(times_ms[1:][inside], times_ms[:-1][inside] + 1))

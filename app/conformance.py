@@ -121,10 +121,11 @@ def _on_reservation(picture: AirPicture, tolerance_ms: int) -> set[int]:
 
 
 def _track(picture: AirPicture, aircraft: Aircraft, sighting: Sighting, thresholds: Thresholds) -> Assessment:
-    if picture.at_ms - sighting.time_ms > thresholds.freshness_ms:
-        return Assessment(aircraft, None, sighting, Conformance.LOST, (Reason.LOST,))
+    is_fresh = picture.at_ms - sighting.time_ms <= thresholds.freshness_ms
     if sighting.airborne is False:
-        return Assessment(aircraft, None, sighting, Conformance.CONFORMING, is_fresh=True)
+        return Assessment(aircraft, None, sighting, Conformance.CONFORMING, is_fresh=is_fresh)
+    if not is_fresh:
+        return Assessment(aircraft, None, sighting, Conformance.LOST, (Reason.LOST,), is_airborne=True)
     return Assessment(
         aircraft, None, sighting, Conformance.DEVIATING, (Reason.NO_FLIGHT_INTENT,), sighting.block, True, True
     )
@@ -149,6 +150,8 @@ def _flight(
     if not is_airborne(flight, sighting):
         return _on_the_ground(aircraft, flight, sighting, is_due=is_due, is_fresh=is_fresh, tolerance_ms=tolerance_ms)
     if not is_fresh:
+        if path is not None and _reached_its_end(path, sighting) and now > path.depart_ms[-1] + tolerance_ms:
+            return Assessment(aircraft, flight, sighting, Conformance.CONFORMING)
         return Assessment(aircraft, flight, sighting, Conformance.LOST, (Reason.LOST,), is_airborne=True)
     if path is not None and is_on_reservation:
         reasons = (Reason.NOT_ACTIVATED,) if flight.activated_ms is None and flight.state in OPEN_STATES else ()
@@ -276,7 +279,11 @@ def _is_over(path: Path, assessment: Assessment, now_ms: int, over_ms: int) -> b
     sighting = assessment.sighting
     if sighting is None:
         return False
-    is_there = sighting.block == path.blocks[-1] and sighting.time_ms >= path.arrive_ms[0]
-    if is_there and sighting.airborne is False:
+    if sighting.airborne is False and _reached_its_end(path, sighting):
         return True
-    return now_ms > over_ms and (not assessment.is_airborne or (is_there and not assessment.is_fresh))
+    return now_ms > over_ms and not assessment.is_airborne
+
+
+def _reached_its_end(path: Path, sighting: Sighting) -> bool:
+    """Tell whether a flight was seen in its last block since its departure."""
+    return sighting.block == path.blocks[-1] and sighting.time_ms >= path.arrive_ms[0]

@@ -61,7 +61,8 @@ export class CityMap {
     map.setPaintProperty("buildings", "fill-extrusion-color", [
       "interpolate", ["linear"], ["get", "height"], 0, colours.building, 90, colours["building-high"],
     ]);
-    for (const status of STATUSES) {
+    map.setPaintProperty("green", "fill-extrusion-color", colours.green);
+    for (const status of ["yellow", "red"]) {
       const image = hatch(status, colours[status]);
       if (map.hasImage(status)) map.updateImage(status, image);
       else map.addImage(status, image, { pixelRatio: 2 });
@@ -120,7 +121,7 @@ export class CityMap {
   #home() {
     // Room for the cards at the left.
     const above = this.#map.cameraForBounds(this.#bounds, { padding: { left: 110, top: 0, right: 0, bottom: 0 } });
-    return { center: above.center, zoom: above.zoom + 0.2, pitch: 50, bearing: -14 };
+    return { center: above.center, zoom: above.zoom + 0.08, pitch: 50, bearing: -14 };
   }
 
   #ring(block) {
@@ -167,7 +168,7 @@ export class CityMap {
           id: status, type: "fill-extrusion", source: "blocks",
           filter: ["==", ["get", "status"], status],
           paint: {
-            "fill-extrusion-pattern": status,
+            ...(status === "green" ? {} : { "fill-extrusion-pattern": status }),
             "fill-extrusion-base": ["get", "base"],
             "fill-extrusion-height": ["get", "top"],
             "fill-extrusion-opacity": OPACITY[status],
@@ -193,7 +194,7 @@ function flightMs() {
   return matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 900;
 }
 
-/** Return a status's fill: plain for green, hatched one way for yellow and both ways for red. */
+/** Return a status's fill: hatched one way for yellow and both ways for red; green is plain. */
 function hatch(status, colour) {
   const canvas = new OffscreenCanvas(HATCH_PX, HATCH_PX);
   const context = canvas.getContext("2d");
@@ -201,8 +202,7 @@ function hatch(status, colour) {
   context.fillRect(0, 0, HATCH_PX, HATCH_PX);
   context.strokeStyle = "rgb(0 0 0 / 55%)";
   context.lineWidth = 5;
-  const lines = { green: [], yellow: [1], red: [1, -1] }[status];
-  for (const slope of lines) {
+  for (const slope of status === "red" ? [1, -1] : [1]) {
     for (const shift of [-1, 0, 1]) {
       context.beginPath();
       context.moveTo(shift * HATCH_PX, slope > 0 ? 0 : HATCH_PX);

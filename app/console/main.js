@@ -56,8 +56,8 @@ class Console {
     this.#grid = new Grid(airspace);
     this.#city = await CityMap.open(byId("map"), this.#grid, airspace.bounds, buildings);
     const [west, south, east, north] = airspace.bounds;
-    this.#traffic = new Traffic(new LocalFrame((west + east) / 2, (south + north) / 2), this.#grid, palette(), byId("tags"));
-    this.#traffic.addTo(this.#city.map);
+    const frame = new LocalFrame((west + east) / 2, (south + north) / 2);
+    this.#traffic = new Traffic(this.#city.map, frame, this.#grid, palette(), byId("tags"));
     this.#addPanels();
     this.#addLegend();
     byId("legend").open = innerWidth >= 1200;
@@ -240,7 +240,6 @@ class Console {
     const isHeat = this.#filters.heatSpan !== null;
     this.#city.showBlocks(isHeat ? [] : shown);
     this.#traffic.showAlarms(isHeat ? [] : shown);
-    this.#city.map.triggerRepaint();
   }
 
   async #showHeat() {
@@ -288,7 +287,6 @@ class Console {
       this.#showHeat();
       this.#refresh();
       this.#traffic.showPlanned(await aircraftAt(moment, signal));
-      this.#city.map.triggerRepaint();
     } catch (error) {
       if (!aborted(error)) this.#notice(`${clockTime(moment)} UTC: ${error.message}`);
     }
@@ -301,7 +299,6 @@ class Console {
     this.#traffic.selected = selection?.id ?? null;
     this.#traffic.showBlock(selection?.kind === "block" ? selection.block : null);
     this.#traffic.showPath([], []);
-    this.#city.map.triggerRepaint();
     if (selection === null) {
       this.#details.clear();
       return;
@@ -350,7 +347,7 @@ class Console {
   #animate(at, drawn = 0) {
     const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const due = at - drawn >= (calm ? REFRESH_MS : FRAME_MS);
-    if (due && this.#traffic.moves && this.#picture.state === "live") this.#city.map.triggerRepaint();
+    if (due && this.#picture.state === "live" && this.#moment === null) this.#traffic.draw();
     requestAnimationFrame((next) => this.#animate(next, due ? at : drawn));
   }
 

@@ -1,8 +1,9 @@
 /**
  * What MapLibre has no layer for: aircraft and lines at their altitudes, hundreds of them moving in every frame.
  *
- * A custom layer with two programs. Sprites are squares that lie in the air, turned by heading, of one size on screen;
- * segments are lines of one width on screen. Both are drawn over everything else: an ops room looks through houses.
+ * A canvas of its own above the map's, so that aircraft move smoothly while city and blocks, which are much dearer, are
+ * drawn only when they change. Two programs: sprites are squares that lie in the air, turned by heading, of one size on
+ * screen; segments are lines of one width on screen. Nothing hides them: an ops room looks through houses.
  */
 
 import { SYMBOLS, atlas } from "/console/symbols.js";
@@ -87,29 +88,49 @@ void main() {
 }`;
 
 export class Scene {
-  id = "scene";
-  type = "custom";
-  renderingMode = "3d";
-  /** The matrix of the last frame, local metres to clip space; null before it. */
+  /** Takes local metres to clip space; null before the map's first frame. */
   matrix = null;
-  #frame;
-  #compose;
+  #gl;
+  #map;
   #colours;
   #atlasIsOld = true;
-  #still = new Float32Array(0);
-  #stillIsOld = true;
+  #batches;
+  #texture;
 
-  /** `compose` is called in every frame and returns `{sprites, segments}`, as `spriteArray` and `segmentArray` make them. */
-  constructor(frame, colours, compose) {
-    this.#frame = frame;
+  /** `compose` is called for every frame and returns `{sprites, segments}`, made by `spriteArray` and `segmentArray`. */
+  constructor(map, frame, colours, compose) {
+    this.#map = map;
     this.#colours = colours;
-    this.#compose = compose;
+    this.compose = compose;
+    const canvas = document.createElement("canvas");
+    canvas.className = "scene";
+    map.getCanvasContainer().append(canvas);
+    const gl = canvas.getContext("webgl2", { antialias: false });
+    this.#gl = gl;
+    const corners = buffer(gl, CORNERS, gl.STATIC_DRAW);
+    const lines = [["a_from", 3], ["a_to", 3], ["a_colour", 4], ["a_width", 1], ["a_dash", 1]];
+    this.#batches = {
+      still: batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, lines),
+      moving: batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, lines),
+      sprites: batch(gl, corners, SPRITE_VERTEX, SPRITE_FRAGMENT, [
+        ["a_position", 3], ["a_heading", 1], ["a_cell", 1], ["a_scale", 1],
+      ]),
+    };
+    this.#texture = gl.createTexture();
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    map.addLayer({
+      id: "camera", type: "custom", renderingMode: "3d",
+      render: (_, { defaultProjectionData }) => {
+        this.matrix = frame.matrix(defaultProjectionData.mainMatrix);
+      },
+    });
+    map.on("render", () => this.draw());
   }
 
   /** Take lines that stay as they are for a while. */
   setStill(segments) {
-    this.#still = segmentArray(segments);
-    this.#stillIsOld = true;
+    fill(this.#gl, this.#batches.still, segmentArray(segments));
   }
 
   /** Draw in other colours from now on. */
@@ -118,52 +139,39 @@ export class Scene {
     this.#atlasIsOld = true;
   }
 
-  onAdd(map, gl) {
-    this.map = map;
-    const corners = buffer(gl, CORNERS, gl.STATIC_DRAW);
-    this.sprites = batch(gl, corners, SPRITE_VERTEX, SPRITE_FRAGMENT, [
-      ["a_position", 3], ["a_heading", 1], ["a_cell", 1], ["a_scale", 1],
-    ]);
-    const layout = [["a_from", 3], ["a_to", 3], ["a_colour", 4], ["a_width", 1], ["a_dash", 1]];
-    this.still = batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, layout);
-    this.moving = batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, layout);
-    this.texture = gl.createTexture();
-  }
+  /** Draw a frame, as the map's camera stands. */
+  draw() {
+    if (this.matrix === null) return;
+    const gl = this.#gl;
+    const { width, height, clientWidth, clientHeight } = this.#map.getCanvas();
+    if (gl.canvas.width !== width || gl.canvas.height !== height) Object.assign(gl.canvas, { width, height });
+    gl.viewport(0, 0, width, height);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    const { sprites, segments } = this.compose(this.matrix);
+    const { still, moving, sprites: aircraft } = this.#batches;
+    const matrix = new Float32Array(this.matrix);
+    const halfScreen = [clientWidth / 2, clientHeight / 2];
 
-  render(gl, { defaultProjectionData }) {
-    const matrix = this.#frame.matrix(defaultProjectionData.mainMatrix);
-    this.matrix = matrix;
-    const { sprites, segments } = this.#compose(matrix);
-    gl.disable(gl.DEPTH_TEST);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    const canvas = this.map.getCanvas();
-    const halfScreen = [canvas.clientWidth / 2, canvas.clientHeight / 2];
-    const asFloats = new Float32Array(matrix);
-
-    for (const [lines, data, isNew] of [[this.still, this.#still, this.#stillIsOld], [this.moving, segments, true]]) {
+    fill(gl, moving, segments);
+    for (const lines of [still, moving]) {
       gl.useProgram(lines.program);
-      gl.uniformMatrix4fv(lines.uniform("u_matrix"), false, asFloats);
+      gl.uniformMatrix4fv(lines.uniform("u_matrix"), false, matrix);
       gl.uniform2fv(lines.uniform("u_half_screen"), halfScreen);
-      draw(gl, lines, data, SEGMENT_FLOATS, isNew);
+      drawBatch(gl, lines);
     }
-    this.#stillIsOld = false;
 
-    gl.useProgram(this.sprites.program);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.useProgram(aircraft.program);
     if (this.#atlasIsOld) this.#drawAtlas(gl);
-    gl.uniformMatrix4fv(this.sprites.uniform("u_matrix"), false, asFloats);
-    gl.uniform1f(this.sprites.uniform("u_metres"), metresOfPixel(matrix, halfScreen[0]));
-    gl.uniform1f(this.sprites.uniform("u_half_px"), SPRITE_PX / 2);
-    gl.uniform1f(this.sprites.uniform("u_cells"), SYMBOLS.length);
-    gl.uniform1i(this.sprites.uniform("u_atlas"), 0);
-    draw(gl, this.sprites, sprites, SPRITE_FLOATS, true);
-    gl.bindVertexArray(null);
+    gl.uniformMatrix4fv(aircraft.uniform("u_matrix"), false, matrix);
+    gl.uniform1f(aircraft.uniform("u_metres"), metresOfPixel(this.matrix, halfScreen[0]));
+    gl.uniform1f(aircraft.uniform("u_half_px"), SPRITE_PX / 2);
+    gl.uniform1f(aircraft.uniform("u_cells"), SYMBOLS.length);
+    fill(gl, aircraft, sprites);
+    drawBatch(gl, aircraft);
   }
 
   #drawAtlas(gl) {
-    gl.pixelStorei(gl.UNPACK_FLIP_Y_WEBGL, false);
+    gl.bindTexture(gl.TEXTURE_2D, this.#texture);
     gl.pixelStorei(gl.UNPACK_PREMULTIPLY_ALPHA_WEBGL, true);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, atlas(this.#colours, CELL));
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
@@ -195,13 +203,16 @@ function metresOfPixel(matrix, halfWidth) {
   return 1 / (Math.hypot(matrix[0], matrix[4], matrix[8]) * halfWidth);
 }
 
-function draw(gl, made, floats, perInstance, isNew) {
+/** Hand over a batch's instances. */
+function fill(gl, made, floats) {
+  gl.bindBuffer(gl.ARRAY_BUFFER, made.buffer);
+  gl.bufferData(gl.ARRAY_BUFFER, floats, gl.DYNAMIC_DRAW);
+  made.count = floats.length / made.floats;
+}
+
+function drawBatch(gl, made) {
   gl.bindVertexArray(made.array);
-  if (isNew) {
-    gl.bindBuffer(gl.ARRAY_BUFFER, made.buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, floats, gl.DYNAMIC_DRAW);
-  }
-  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, floats.length / perInstance);
+  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, made.count);
 }
 
 /** Return a program with the square's corners and one buffer of instances laid out as given. */
@@ -219,10 +230,10 @@ function batch(gl, corners, vertex, fragment, layout) {
   gl.bindVertexArray(array);
   attribute(gl, program, corners, "a_corner", 2, 0, 0, 0);
   const instances = gl.createBuffer();
-  const stride = 4 * layout.reduce((sum, [, size]) => sum + size, 0);
+  const floats = layout.reduce((sum, [, size]) => sum + size, 0);
   let offset = 0;
   for (const [name, size] of layout) {
-    attribute(gl, program, instances, name, size, stride, offset, 1);
+    attribute(gl, program, instances, name, size, 4 * floats, offset, 1);
     offset += 4 * size;
   }
   gl.bindVertexArray(null);
@@ -231,7 +242,7 @@ function batch(gl, corners, vertex, fragment, layout) {
     if (!locations.has(name)) locations.set(name, gl.getUniformLocation(program, name));
     return locations.get(name);
   };
-  return { program, array, buffer: instances, uniform };
+  return { program, array, buffer: instances, floats, count: 0, uniform };
 }
 
 function attribute(gl, program, source, name, size, stride, offset, divisor) {

@@ -17,7 +17,6 @@ const TAG_PX = { width: 170, height: 38 };
 const RANK = { violating: 0, deviating: 1, lost: 2, unseen: 3 };
 
 export class Traffic {
-  scene;
   /** The flight or track that is selected, and the one under the pointer: ids or null. */
   selected = null;
   hovered = null;
@@ -29,21 +28,17 @@ export class Traffic {
   #colours;
   #tags;
   #drawn = [];
-  #canvas;
+  #map;
+  #scene;
   #still = { path: [], reserved: [], block: [], ends: [], alarms: [] };
 
-  constructor(frame, grid, colours, tags) {
+  constructor(map, frame, grid, colours, tags) {
+    this.#map = map;
     this.#frame = frame;
     this.#grid = grid;
     this.#colours = colours;
     this.#tags = tags;
-    this.scene = new Scene(frame, colours, (matrix) => this.#compose(matrix));
-  }
-
-  /** Draw on this canvas's map. */
-  addTo(map) {
-    this.#canvas = map.getCanvas();
-    map.addLayer(this.scene);
+    this.#scene = new Scene(map, frame, colours, (matrix) => this.#compose(matrix));
   }
 
   /** Take the flights of a tick. */
@@ -54,17 +49,18 @@ export class Traffic {
   /** Show aircraft of another moment, `{flight, lon, lat, alt_m, heading}`, instead of the present ones; null ends that. */
   showPlanned(aircraft) {
     this.#planned = aircraft;
+    this.draw();
   }
 
-  /** Whether anything moves from frame to frame. */
-  get moves() {
-    return this.#planned === null && this.#drawn.length > 0;
+  /** Draw a frame. */
+  draw() {
+    this.#scene.draw();
   }
 
   /** Draw in other colours from now on. */
   setColours(colours) {
     this.#colours = colours;
-    this.scene.setColours(colours);
+    this.#scene.setColours(colours);
   }
 
   /** Show a trajectory and the blocks reserved for it; empty lists hide them. A preview is dashed. */
@@ -124,7 +120,7 @@ export class Traffic {
 
   #compose(matrix) {
     const aircraft = this.#planned ?? this.#motion.positions(performance.now());
-    const { clientWidth: width, clientHeight: height } = this.#canvas;
+    const { clientWidth: width, clientHeight: height } = this.#map.getCanvas();
     const sprites = [];
     const segments = [];
     this.#drawn = aircraft.map(({ flight, heading, ...position }) => {
@@ -156,7 +152,8 @@ export class Traffic {
     const taken = [];
     let used = 0;
     for (const { flight, symbol, screen } of wanted) {
-      const [x, y] = [Math.round(screen[0]) + 16, Math.round(screen[1]) - 34];
+      const right = Math.round(screen[0]) + 16;
+      const [x, y] = [right + TAG_PX.width < width ? right : right - 32 - TAG_PX.width, Math.round(screen[1]) - 34];
       const covered = taken.some(([left, top]) => Math.abs(left - x) < TAG_PX.width && Math.abs(top - y) < TAG_PX.height);
       if (covered || used === MOST_TAGS) continue;
       taken.push([x, y]);
@@ -177,7 +174,8 @@ export class Traffic {
 
   #setStill() {
     const { alarms, reserved, path, ends, block } = this.#still;
-    this.scene.setStill([...alarms, ...reserved, ...path, ...ends, ...block]);
+    this.#scene.setStill([...alarms, ...reserved, ...path, ...ends, ...block]);
+    this.draw();
   }
 
   /** Return the lines of a block's floor. */
