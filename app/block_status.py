@@ -56,7 +56,7 @@ def statuses(
     for block in sorted(reserved_by.keys() | present.keys()):
         holder, here = reserved_by.get(block), present.get(block, ())
         red = _alarms(holder, here, is_occupied=bool(occupied[block]))
-        # The states of flights are those of the present.
+        # A forecast speaks of reservations alone, whatever state a flight is in now.
         yellow = () if picture.is_forecast else _deviations(holder, here, assessed)
         status = Status.RED if red else Status.YELLOW if yellow else Status.GREEN
         concerned = dict.fromkeys([*([] if holder is None else [holder]), *here])

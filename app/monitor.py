@@ -78,7 +78,8 @@ class Monitor:
         self._observe = observe
         self._reach = Reach(
             before_ms=thresholds.freshness_ms + thresholds.tolerance_ms,
-            after_ms=thresholds.tolerance_ms,
+            # A position may be ahead of the clock by the tolerance, and ahead of its reservation by another.
+            after_ms=2 * thresholds.tolerance_ms,
             due_ms=_DUE_MS,
             track_ms=_TRACK_MS,
         )

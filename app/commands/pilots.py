@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from itertools import count
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, TypeVar
@@ -36,6 +37,7 @@ _BEFORE_MS = 10_000
 # Where a clock has gone back by more, it was set.
 _SET_BACK_MS = 60_000
 _POLL_S = 1.0
+_GLANCE_S = 0.25
 _RECONNECT_S = 0.5
 _READ_CLOCK_S = 10.0
 
@@ -166,7 +168,11 @@ class Dispatch:
                 self._do_what_is_due()
             except ServiceUnreachable:
                 # The reports tell.
-                self._over.wait(_POLL_S)
+                self._over.wait(_RECONNECT_S)
+                continue
+            except ProblemAnswer as problem:
+                self.refused[problem.reason] += 1
+                self._over.wait(_RECONNECT_S)
                 continue
             wait_s = next_poll - time.monotonic()
             if self._due:
@@ -196,6 +202,8 @@ class Dispatch:
         try:
             intent = self._client.flight_intent(id_)
         except ProblemAnswer as problem:
+            if problem.status == HTTPStatus.SERVICE_UNAVAILABLE:
+                raise
             # It may have been removed by now.
             self.refused[f"flight intent: {problem.reason}"] += 1
             return
@@ -231,6 +239,9 @@ class Dispatch:
                 try:
                     what(id_)
                 except ProblemAnswer as problem:
+                    # What is only busy is asked again.
+                    if problem.status == HTTPStatus.SERVICE_UNAVAILABLE:
+                        raise
                     self.refused[f"activate or end: {problem.reason}"] += 1
             heapq.heappop(self._due)
 
@@ -270,23 +281,20 @@ class Pilots:
                         return
                     if dispatching.done():
                         dispatching.result()
-                    self._tick(self._await_tick())
+                    due = self._next_tick()
+                    wait_s = self._clock.seconds_until(due)
+                    time.sleep(min(wait_s, _GLANCE_S))
+                    if wait_s <= _GLANCE_S:
+                        self._tick(due)
         finally:
             self.report.refused += self._dispatch.refused
 
-    def _await_tick(self) -> int:
-        """Wait for the next multiple of the interval, and return it. Those that have passed meanwhile are skipped."""
+    def _next_tick(self) -> int:
+        """Return the next multiple of the interval; where some have passed since the last, the newest of them."""
         now = self._clock.now()
         if now < self._last_ms - _SET_BACK_MS:
             self._last_ms = now
-        due = (self._last_ms // self._interval_ms + 1) * self._interval_ms
-        if now - due >= self._interval_ms:
-            skipped = (now - due) // self._interval_ms
-            self.report.skipped += skipped
-            due += skipped * self._interval_ms
-        time.sleep(self._clock.seconds_until(due))
-        self._last_ms = due
-        return due
+        return max(self._last_ms // self._interval_ms + 1, now // self._interval_ms) * self._interval_ms
 
     def _take_up(self) -> None:
         for aircraft in _taken(self._dispatch.found):
@@ -300,6 +308,8 @@ class Pilots:
 
     def _tick(self, time_ms: int) -> None:
         """Report where everybody is."""
+        self.report.skipped += (time_ms - self._last_ms - 1) // self._interval_ms
+        self._last_ms = time_ms
         while self._waiting and self._waiting[0][0] <= time_ms:
             aircraft = heapq.heappop(self._waiting)[2]
             self._flying[aircraft.id] = aircraft

@@ -36,8 +36,7 @@ export class AlertsPanel {
       when.title = `since ${clockTime(Date.parse(alert.raised))} UTC`;
       setText(message, alert.message);
       setText(reasons, [alert.conformance, ...alert.reasons.map(flightReason)].join(" · "));
-      setText(threats, alert.threatens.map(({ flight_intent_id: id, block, reach_s: reach }) =>
-        `reaches ${nameOf(id)} at [${block.join(", ")}] in ${Math.round(reach)} s`).join("; "));
+      setText(threats, threatWords(alert.threatens, nameOf));
     });
   }
 
@@ -59,4 +58,17 @@ export class AlertsPanel {
     if (news.length === 1) setText(this.#announcer, `${news[0].severity} alert: ${news[0].message}`);
     if (news.length > 1) setText(this.#announcer, `${news.length} new alerts. ${news[0].message}`);
   }
+}
+
+/** Return which flights are threatened and when first, the most urgent in full. */
+function threatWords(threats, nameOf) {
+  const first = new Map();
+  for (const threat of threats) {
+    const known = first.get(threat.flight_intent_id);
+    if (!known || threat.reach_s < known.reach_s) first.set(threat.flight_intent_id, threat);
+  }
+  const [most, ...others] = [...first.values()].sort((one, other) => one.reach_s - other.reach_s);
+  if (!most) return "";
+  const words = `reaches ${nameOf(most.flight_intent_id)} at [${most.block.join(", ")}] in ${Math.round(most.reach_s)} s`;
+  return others.length ? `${words}, then ${others.map(({ flight_intent_id: id }) => nameOf(id)).join(", ")}` : words;
 }

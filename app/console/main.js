@@ -150,8 +150,6 @@ class Console {
     this.#flights.setColours(colours);
     this.#details.setColours(colours);
     this.#addLegend();
-    this.#choose(this.#selection);
-    this.#showBlocks();
     this.#showLists();
   }
 
@@ -174,15 +172,11 @@ class Console {
     picture.addEventListener("alerts", () => this.#showLists());
     picture.addEventListener("link", () => this.#refresh());
     picture.addEventListener("tick", () => this.#refresh());
-    picture.addEventListener("journal", ({ detail }) => this.#takeJournal(detail));
-  }
-
-  #takeJournal(entry) {
-    const selected = this.#selection;
-    if (selected?.kind === "flight" && selected.id === entry.flight_intent_id && entry.kind !== "conformance") {
-      this.#choose(selected);
-    }
-    if (entry.sequence && !["activated", "ended"].includes(entry.kind)) setText(byId("latest"), journalWords(entry));
+    picture.addEventListener("intent", ({ detail: entry }) => {
+      setText(byId("latest"), journalWords(entry));
+      if (this.#selection?.id === entry.flight_intent_id) this.#showDetails();
+    });
+    picture.addEventListener("conformance", ({ detail: entry }) => setText(byId("latest"), journalWords(entry)));
   }
 
   #showLists() {
@@ -210,24 +204,24 @@ class Console {
     byId("stale").hidden = !old;
     document.body.classList.toggle("old", old);
     if (old) setText(byId("stale"), `Stale since ${silent}: the service is not heard${state === "reconnecting" ? ", connecting again" : ""}.`);
-    const { counts } = this.#moment ?? this.#picture;
-    const airborne = flights.filter(({ position }) => position?.airborne !== false && position !== null).length;
-    this.#showCounts(counts, airborne);
+    const flying = flights.filter(({ position }) => position !== null && position.airborne !== false).length;
+    if (this.#moment) this.#showCounts(this.#moment.counts, this.#moment.flying);
+    else this.#showCounts(this.#picture.counts, flying);
     this.#timeline.refresh();
     this.#details.refresh();
   }
 
-  #showCounts(counts, airborne) {
+  #showCounts(counts, flying) {
     const list = byId("counts");
     if (!list.firstElementChild) {
       list.append(
         ...["green", "yellow", "red"].map((status) => element("li", { id: `count-${status}`, title: `blocks: ${STATUS_WORDS[status]}` },
           element("span", { class: "mark", "data-status": status, "aria-hidden": "true" }),
           element("b"), element("span", { text: ` ${status}` }))),
-        element("li", { id: "count-flights", title: "aircraft in the air" }, element("b"), element("span", { text: " flying" })));
+        element("li", { id: "count-flights", title: "aircraft in the air" }, element("b"), " flying"));
     }
     for (const status of ["green", "yellow", "red"]) setText(byId(`count-${status}`).querySelector("b"), String(counts[status]));
-    setText(byId("count-flights").querySelector("b"), String(airborne));
+    setText(byId("count-flights").querySelector("b"), String(flying));
   }
 
   /** Return the blocks shown, by key. */
@@ -281,12 +275,15 @@ class Console {
     const { signal } = this.#momentRequest = new AbortController();
     try {
       const { blocks, counts } = await blocksAt(moment, signal);
-      this.#moment = { counts, blocks: new Map(blocks.map((entry) => [keyOf(entry.block), entry])) };
+      this.#moment = { counts, flying: 0, blocks: new Map(blocks.map((entry) => [keyOf(entry.block), entry])) };
       this.#traffic.showPlanned([]);
       this.#showBlocks();
       this.#showHeat();
       this.#refresh();
-      this.#traffic.showPlanned(await aircraftAt(moment, signal));
+      const aircraft = await aircraftAt(moment, signal);
+      this.#traffic.showPlanned(aircraft);
+      this.#moment.flying = aircraft.length;
+      this.#refresh();
     } catch (error) {
       if (!aborted(error)) this.#notice(`${clockTime(moment)} UTC: ${error.message}`);
     }
@@ -299,14 +296,16 @@ class Console {
     this.#traffic.selected = selection?.id ?? null;
     this.#traffic.showBlock(selection?.kind === "block" ? selection.block : null);
     this.#traffic.showPath([], []);
-    if (selection === null) {
-      this.#details.clear();
-      return;
-    }
-    if (selection.kind === "flight") this.#details.showFlight(selection.id);
-    if (selection.kind === "track") this.#details.showTrack(selection.id);
-    if (selection.kind === "block") this.#details.showBlock(selection.block);
-    this.#openTab("details");
+    this.#showDetails();
+    if (selection !== null) this.#openTab("details");
+  }
+
+  #showDetails() {
+    const selection = this.#selection;
+    if (selection === null) this.#details.clear();
+    if (selection?.kind === "flight") this.#details.showFlight(selection.id);
+    if (selection?.kind === "track") this.#details.showTrack(selection.id);
+    if (selection?.kind === "block") this.#details.showBlock(selection.block);
   }
 
   /** Select an alert's or a list's flight, and fly there. */

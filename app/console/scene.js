@@ -54,6 +54,8 @@ in float a_width;
 in float a_dash;
 out vec4 v_colour;
 out float v_along;
+out float v_off;
+out float v_half_width;
 out float v_dash;
 void main() {
   vec4 from = u_matrix * vec4(a_from, 1.0);
@@ -65,7 +67,8 @@ void main() {
   vec2 on_screen = (to.xy / to.w - from.xy / from.w) * u_half_screen;
   float length_px = length(on_screen);
   vec2 along = length_px > 0.0 ? on_screen / length_px : vec2(1.0, 0.0);
-  vec2 across = vec2(-along.y, along.x) * a_corner.x * a_width * 0.5;
+  v_off = a_corner.x * (a_width * 0.5 + 0.5);
+  vec2 across = vec2(-along.y, along.x) * v_off;
   float end = a_corner.y * 0.5 + 0.5;
   vec4 position = mix(from, to, end);
   // Drawn over by half a width, so that corners of a path have no gaps.
@@ -73,18 +76,23 @@ void main() {
   gl_Position = vec4(position.xy + (across + over) / u_half_screen * position.w, 0.0, position.w);
   v_colour = a_colour;
   v_along = end * length_px;
+  v_half_width = a_width * 0.5;
   v_dash = a_dash;
 }`;
 
 const SEGMENT_FRAGMENT = `#version 300 es
-precision mediump float;
+precision highp float;
 in vec4 v_colour;
 in float v_along;
+in float v_off;
+in float v_half_width;
 in float v_dash;
 out vec4 colour;
 void main() {
   if (v_dash > 0.0 && mod(v_along, 2.0 * v_dash) > v_dash) discard;
-  colour = vec4(v_colour.rgb * v_colour.a, v_colour.a);
+  // Fades out over the last pixel, which is what multisampling would do at many times the price.
+  float alpha = v_colour.a * clamp(v_half_width + 0.5 - abs(v_off), 0.0, 1.0);
+  colour = vec4(v_colour.rgb * alpha, alpha);
 }`;
 
 export class Scene {
@@ -105,7 +113,7 @@ export class Scene {
     const canvas = document.createElement("canvas");
     canvas.className = "scene";
     map.getCanvasContainer().append(canvas);
-    const gl = canvas.getContext("webgl2", { antialias: false });
+    const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
     this.#gl = gl;
     const corners = buffer(gl, CORNERS, gl.STATIC_DRAW);
     const lines = [["a_from", 3], ["a_to", 3], ["a_colour", 4], ["a_width", 1], ["a_dash", 1]];

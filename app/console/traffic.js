@@ -30,7 +30,11 @@ export class Traffic {
   #drawn = [];
   #map;
   #scene;
-  #still = { path: [], reserved: [], block: [], ends: [], alarms: [] };
+  /** What the still lines show; they are made anew from it when the colours change. */
+  #path = { trajectory: [], reservations: [], preview: false };
+  #block = null;
+  #alarms = [];
+  #ends = { origin: null, destination: null };
 
   constructor(map, frame, grid, colours, tags) {
     this.#map = map;
@@ -61,47 +65,31 @@ export class Traffic {
   setColours(colours) {
     this.#colours = colours;
     this.#scene.setColours(colours);
+    this.#drawStill();
   }
 
   /** Show a trajectory and the blocks reserved for it; empty lists hide them. A preview is dashed. */
   showPath(trajectory, reservations, { preview = false } = {}) {
-    const colour = rgba(this.#colours.accent);
-    const points = trajectory.map((waypoint) => this.#frame.local(waypoint));
-    const [first, last] = [points.at(0), points.at(-1)];
-    this.#still.path = points.slice(1).map((to, index) => ({
-      from: points[index], to, colour, width: 4, dash: preview ? 7 : 0,
-    }));
-    for (const end of first ? [first, last] : []) {
-      this.#still.path.push({ from: [end[0], end[1], 0], to: end, colour, width: 2, dash: 3 });
-    }
-    const pale = rgba(this.#colours.accent, 0.35);
-    this.#still.reserved = reservations.flatMap(({ block }) => this.#floor(block, pale));
-    this.#setStill();
+    this.#path = { trajectory, reservations, preview };
+    this.#drawStill();
   }
 
   /** Draw a box around a block; null removes it. */
   showBlock(block) {
-    this.#still.block = block === null ? [] : this.#box(block, rgba(this.#colours.accent), 3);
-    this.#setStill();
+    this.#block = block;
+    this.#drawStill();
   }
 
-  /** Draw boxes around the blocks that are not green. */
+  /** Draw boxes around those of these blocks that are not green. */
   showAlarms(entries) {
-    this.#still.alarms = entries
-      .filter(({ status }) => status !== "green")
-      .flatMap(({ block, status }) => this.#box(block, rgba(this.#colours[status], 0.9), status === "red" ? 2.2 : 1.2));
-    this.#setStill();
+    this.#alarms = entries.filter(({ status }) => status !== "green");
+    this.#drawStill();
   }
 
   /** Draw poles from the ground to the chosen origin and destination, positions or null. */
-  showEnds({ origin, destination }) {
-    const pole = (end, colour) => {
-      if (end === null) return [];
-      const top = this.#frame.local(end);
-      return [{ from: [top[0], top[1], 0], to: top, colour: rgba(colour), width: 3 }];
-    };
-    this.#still.ends = [...pole(origin, this.#colours.origin), ...pole(destination, this.#colours.destination)];
-    this.#setStill();
+  showEnds(ends) {
+    this.#ends = ends;
+    this.#drawStill();
   }
 
   /** Return the flight or track drawn nearest to a point of the canvas, null where none is. */
@@ -172,10 +160,34 @@ export class Traffic {
     return [this.hovered, this.selected].includes(idOf(flight)) ? -1 : RANK[symbol];
   }
 
-  #setStill() {
-    const { alarms, reserved, path, ends, block } = this.#still;
-    this.#scene.setStill([...alarms, ...reserved, ...path, ...ends, ...block]);
+  #drawStill() {
+    const colours = this.#colours;
+    const pale = rgba(colours.accent, 0.35);
+    this.#scene.setStill([
+      ...this.#alarms.flatMap(({ block, status }) =>
+        this.#box(block, rgba(colours[status], 0.9), status === "red" ? 2.2 : 1.2)),
+      ...this.#path.reservations.flatMap(({ block }) => this.#floor(block, pale)),
+      ...this.#pathLines(),
+      ...Object.entries(this.#ends).flatMap(([end, position]) =>
+        position === null ? [] : [this.#pole(this.#frame.local(position), { colour: rgba(colours[end]), width: 3 })]),
+      ...(this.#block === null ? [] : this.#box(this.#block, rgba(colours.accent), 3)),
+    ]);
     this.draw();
+  }
+
+  #pathLines() {
+    const colour = rgba(this.#colours.accent);
+    const points = this.#path.trajectory.map((waypoint) => this.#frame.local(waypoint));
+    const dash = this.#path.preview ? 7 : 0;
+    return [
+      ...points.slice(1).map((to, index) => ({ from: points[index], to, colour, width: 4, dash })),
+      ...[points.at(0), points.at(-1)].filter(Boolean).map((end) => this.#pole(end, { colour, width: 2, dash: 3 })),
+    ];
+  }
+
+  /** Return a line from the ground to a point. */
+  #pole(top, look) {
+    return { from: [top[0], top[1], 0], to: top, ...look };
   }
 
   /** Return the lines of a block's floor. */

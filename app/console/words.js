@@ -107,6 +107,6 @@ export function flightName({ reference, operator, sequence, track_id: track }) {
 }
 
 /** Return a journal entry in words. */
-export function journalWords({ kind, sequence, time }) {
-  return `#${sequence} ${kind} at ${clockTime(Date.parse(time))} UTC`;
+export function journalWords({ kind, sequence, track_id: track, time }) {
+  return `${track ? `track ${track}` : `#${sequence}`} ${kind} at ${clockTime(Date.parse(time))} UTC`;
 }

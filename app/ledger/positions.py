@@ -13,7 +13,15 @@ from sqlalchemy import Connection, Row, and_, delete, func, insert, or_, select,
 from app.flight_intents import HeldReservations, State
 from app.ledger.queries import BOUND_AT_ONCE, in_the_air
 from app.ledger.rows import to_held
-from app.ledger.tables import flight_intents, journal, newest_positions, position_history, remarks, reservations
+from app.ledger.tables import (
+    counters,
+    flight_intents,
+    journal,
+    newest_positions,
+    position_history,
+    remarks,
+    reservations,
+)
 from app.surveillance import Aircraft, AirPicture, Flight, Path, Reach, Remark, Sighting, Velocity
 from planner.airmatrix import AirMatrix
 
@@ -36,8 +44,9 @@ _HISTORY_COLUMNS = tuple(column.name for column in position_history.c)
 
 def newest(connection: Connection, aircraft: Iterable[Aircraft]) -> dict[Aircraft, Sighting]:
     """Return the newest positions of some aircraft, without their blocks."""
-    sequences = sorted({each.sequence for each in aircraft if not each.track_id})
-    tracks = sorted({each.track_id for each in aircraft if each.track_id})
+    wanted_aircraft = set(aircraft)
+    sequences = sorted(each.sequence for each in wanted_aircraft if not each.track_id)
+    tracks = sorted(each.track_id for each in wanted_aircraft if each.track_id)
     position = newest_positions.c
     found: dict[Aircraft, Sighting] = {}
     for start in range(0, max(len(sequences), len(tracks)), BOUND_AT_ONCE):
@@ -123,6 +132,9 @@ def air_picture(
     wanted = set(held.sequence.tolist())
     if is_forecast:
         return AirPicture(at_ms, held, _flights(connection, wanted), is_forecast=True)
+    if is_past and since_ms < _kept_since(connection):
+        # Nobody knows any more who was seen: only what was reserved can be said, and nobody is missed.
+        return AirPicture(at_ms, held, _as_of(connection, _flights(connection, wanted), at_ms), is_forecast=True)
     if is_past:
         sightings = _seen_until(connection, at_ms, since_ms, track_since_ms)
         wanted.update(aircraft.sequence for aircraft in sightings if not aircraft.track_id)
@@ -138,6 +150,11 @@ def air_picture(
     if is_past:
         flights = _as_of(connection, flights, at_ms)
     return AirPicture(at_ms, held, flights, _located(sightings, grid), remarked(connection))
+
+
+def _kept_since(connection: Connection) -> int:
+    """Return the time from which on positions are kept."""
+    return int(connection.execute(select(counters.c.positions_removed_before)).scalar_one())
 
 
 def _held(connection: Connection, from_ms: int, to_ms: int) -> HeldReservations:

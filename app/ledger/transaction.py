@@ -35,6 +35,17 @@ class ConstraintViolated(Exception):
     """The database refused rows, such as an overlapping reservation: the caller's picture of the ledger was wrong."""
 
 
+@contextmanager
+def _asking() -> Iterator[None]:
+    """Where the database fails, rather than refuses rows, the whole transaction is lost: raise `LedgerUnavailable`."""
+    try:
+        yield
+    except (IntegrityError, DataError):
+        raise
+    except DBAPIError as error:
+        raise LedgerUnavailable(f"the ledger cannot be written: {cause_of(error)}") from error
+
+
 class Transaction:
     """Work on the ledger under the write lock.
 
@@ -122,6 +133,7 @@ class Transaction:
         self._new_intents[intent_id] = intent
         return intent
 
+    @_asking()
     def change(
         self, intent: FlightIntent, state: State, now_ms: int, *, is_free: bool = False, is_activated: bool = False
     ) -> FlightIntent:
@@ -144,6 +156,7 @@ class Transaction:
         held = intent.reservations.until(end_ms) if is_free else intent.reservations
         return intent.changed(revision, state, held, activated_ms)
 
+    @_asking()
     def end_unseen(self, before_ms: int, limit: int, now_ms: int) -> list[tuple[int, str]]:
         """End up to `limit` flights that should have arrived before a time and were never seen; return sequences and
         ids.
@@ -163,18 +176,22 @@ class Transaction:
             )
         return passed
 
+    @_asking()
     def newest_positions(self, aircraft: Iterable[Aircraft]) -> dict[Aircraft, Sighting]:
         """Return where some aircraft were last seen, without the blocks."""
         return positions.newest(self._connection, aircraft)
 
+    @_asking()
     def store_positions(self, reports: Sequence[tuple[Aircraft, Sighting]]) -> None:
         """Write positions, each newer than those before it of the same aircraft."""
         positions.store(self._connection, reports)
 
+    @_asking()
     def remarks(self) -> dict[Aircraft, Remark]:
         """Return what is recorded of aircraft that do not simply conform."""
         return positions.remarked(self._connection)
 
+    @_asking()
     def remark(self, changes: Mapping[Aircraft, Remark | None], now_ms: int) -> None:
         """Record what is remarked of aircraft; None: nothing any more."""
         self.flush()
@@ -191,12 +208,14 @@ class Transaction:
             )
         positions.remark(self._connection, changes)
 
+    @_asking()
     def find(self, intent_id: str) -> FlightIntent | None:
         """Return an intent with its reservations, None if there is none."""
         if intent_id in self._new_intents:
             self.flush()
         return queries.find(self._connection, self._airspace, intent_id)
 
+    @_asking()
     def ids(self, sequences: Iterable[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
         wanted = set(sequences)
@@ -218,6 +237,7 @@ class Transaction:
             query = query.where(queries.in_the_air(time_ms, None))
         return to_held(self._connection.execute(query.order_by(reservations.c.intent)))
 
+    @_asking()
     def answer_to(self, operator: str, key: str, since_ms: int) -> IdempotencyRecord | None:
         """Return the first answer to an idempotency key, None if it is new; one from before `since_ms` is dropped."""
         new = self._new_answers.get((operator, key))

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import orjson
@@ -60,21 +60,24 @@ async def watch(
 async def _events(service: Service, revision: int) -> AsyncIterator[bytes]:
     """Yield events until the client goes or the server ends."""
     watcher = _Watcher(service, revision)
+    tried: View | None = None
     silent_s = 0.0
     while not service.closing.is_set():
         view = service.monitor.latest
-        if view is None or view is watcher.seen:
+        if view is None or view is tried:
             await asyncio.sleep(_POLL_S)
             silent_s += _POLL_S
             if silent_s >= _SILENCE_S:
                 silent_s = 0.0
                 yield format_sse_event(comment="nothing new")
             continue
-        silent_s = 0.0
+        tried, silent_s = view, 0.0
+        after = replace(watcher)
         try:
-            content = await to_thread.run_sync(watcher.news, view)
+            content = await to_thread.run_sync(after.news, view)
+            watcher = after
         except LedgerUnavailable as error:
-            # The next look tells what was missed.
+            # Nothing of it was told; the next look tells it all.
             content = format_sse_event(comment=str(error))
         yield content
 

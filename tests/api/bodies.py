@@ -1,10 +1,11 @@
-"""What operators post, for the districts of the tests."""
+"""What operators and surveillance post, for the districts of the tests."""
 
 from dataclasses import asdict
 from typing import Any
 
 import httpx
 
+from app.flight_intents import Position
 from app.problems import MEDIA_TYPE
 from app.times import format_time
 from planner.errors import Block
@@ -12,6 +13,7 @@ from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, OLD_TOWN, District
 
 SUBMIT = "/v1/flight-intents"
 PREVIEW = "/v1/flight-intents/preview"
+TELEMETRY = "/v1/telemetry"
 
 FLIGHT_INTENT = {
     "id", "sequence", "version", "state", "operator", "reference", "aircraft_type", "priority", "origin", "destination",
@@ -44,6 +46,19 @@ def intent(
     if window_ms is not None:
         body["latest_departure"] = format_time(earliest_ms + window_ms)
     return {**body, **members}
+
+
+def position(
+    place: str | Block | Position, time_ms: int, /, *, district: District = OLD_TOWN, **members: Any
+) -> dict[str, Any]:
+    """Return one position of a report; `members` name the flight or the track, and whatever else is to be said."""
+    where = place if isinstance(place, Position) else district.centre(place)
+    return {"time": format_time(time_ms), **asdict(where), **members}
+
+
+def report(*positions: Any) -> dict[str, Any]:
+    """Return the body of a report."""
+    return {"positions": positions}
 
 
 def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:

@@ -30,6 +30,13 @@ RATE = 100.0
 PATIENCE_S = 20.0
 
 
+@pytest.fixture(autouse=True)
+def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ask more often: the clock runs fast."""
+    monkeypatch.setattr(pilots_module, "_POLL_S", 0.1)
+    monkeypatch.setattr(pilots_module, "_RECONNECT_S", 0.05)
+
+
 def intent(
     sequence: int, departs_in_s: float, row: int = 1, state: State = State.ACCEPTED, **changes: Any
 ) -> FlightIntentAnswer:
@@ -207,7 +214,7 @@ def test_more_aircraft_than_a_request_takes_go_in_several(monkeypatch: pytest.Mo
 
 
 def test_a_flight_that_is_accepted_meanwhile_is_flown_too() -> None:
-    first, second = intent(1, 12), intent(2, 200, row=2)
+    first, second = intent(1, 12), intent(2, 60, row=2)
     service = StandIn([first])
 
     def until(pilots: Pilots) -> bool:
@@ -221,7 +228,7 @@ def test_a_flight_that_is_accepted_meanwhile_is_flown_too() -> None:
 
 
 def test_a_flight_that_is_cancelled_before_it_departs_stays_where_it_is() -> None:
-    service = StandIn([intent(1, 200), intent(2, 210, row=2)])
+    service = StandIn([intent(1, 60), intent(2, 70, row=2)])
     service_intents = list(service.intents)
 
     def until(pilots: Pilots) -> bool:
@@ -248,7 +255,7 @@ def test_a_flight_that_is_cancelled_in_the_air_flies_to_its_end() -> None:
 
 
 def test_of_one_operator_only_its_own_flights_are_flown() -> None:
-    mine, other = intent(1, 200, operator="medlift"), intent(2, 200, row=2)
+    mine, other = intent(1, 60, operator="medlift"), intent(2, 60, row=2)
     asked_for = []
 
     def listen(request: httpx.Request) -> None:
@@ -367,6 +374,33 @@ def test_an_activation_that_is_refused_is_counted_and_the_aircraft_flies_all_the
     assert report.arrived == 1
 
 
+def test_an_activation_for_which_the_service_is_too_busy_is_asked_for_again() -> None:
+    failures = iter(range(2))
+
+    def refuse(request: httpx.Request) -> httpx.Response | None:
+        if request.url.path.endswith("/activate") and next(failures, None) is not None:
+            return httpx.Response(503, json={"type": "/problems/queue-full", "title": "Busy"})
+        return None
+
+    service = StandIn([intent(1, 30)], on_request=refuse)
+    report = fly(service)
+    assert [what for what, _ in service.asked] == ["activate flight-1"]
+    assert report.refused == {"queue-full": 2}
+
+
+def test_a_long_interval_keeps_nobody_waiting_for_the_end() -> None:
+    service = StandIn([intent(1, 60)], rate=1)
+    looks = []
+
+    def until(pilots: Pilots) -> bool:
+        looks.append(pilots.unfinished)
+        return len(looks) == 3
+
+    fly(service, until=until, interval_s=3600)
+    assert looks == [1, 1, 1]
+    assert service.reports == []
+
+
 def test_a_slow_service_makes_ticks_be_skipped_and_nothing_queue() -> None:
     sending = threading.Lock()
 
@@ -399,7 +433,7 @@ def test_a_service_that_does_not_answer_for_a_while_is_asked_again() -> None:
 
 
 def test_the_dispatch_goes_on_after_the_journal_could_not_be_read() -> None:
-    first, failures = intent(1, 150), iter(range(1))
+    first, failures = intent(1, 60), iter(range(1))
 
     def hang_up(request: httpx.Request) -> None:
         if request.url.path == "/v1/events" and next(failures, None) is not None:

@@ -267,4 +267,4 @@ def test_the_version_is_printed(airmatrix: Run, town: Server) -> None:
 
 
 def test_an_unknown_command_is_refused(airmatrix: Run) -> None:
-    airmatrix("fly").assert_misused("fly")
+    airmatrix("levitate").assert_misused("levitate")

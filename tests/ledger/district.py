@@ -51,6 +51,12 @@ class District:
         lon, lat = self.airspace.grid.unproject(x, y)
         return Position(float(lon), float(lat), float(alt_m))
 
+    def point(self, i: float, j: float, alt_m: float = 20.0) -> Position:
+        """Return a point given in blocks from the south-west corner."""
+        grid = self.airspace.grid
+        lon, lat = grid.unproject(grid.origin_x_m + i * grid.block_side_m, grid.origin_y_m + j * grid.block_side_m)
+        return Position(float(lon), float(lat), alt_m)
+
     def submission(
         self,
         origin: str | Block,
@@ -119,3 +125,13 @@ STREET = district("W......E")
 
 # An open square in two layers.
 SQUARE = district("N...\n....\n...S", "....\n....\n....")
+
+# Two lanes, and one between them that nobody has asked for.
+LANES = district(
+    """
+    W......E
+    ........
+    V......F
+    """,
+    "........\n........\n........",
+)

@@ -3,7 +3,7 @@
 import asyncio
 import random
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 
 import pytest
@@ -22,15 +22,6 @@ from tests.ledger.process import (
     until,
 )
 from tests.ledger.test_restart import described, random_submission
-
-
-@pytest.fixture
-def pair(ledger: str, clock: FakeClock) -> Iterator[tuple[Process, Process]]:
-    with (
-        Process(ledger, STREET.airspace, clock) as one,
-        Process(ledger, STREET.airspace, clock) as other,
-    ):
-        yield one, other
 
 
 def at_once(*work: Callable[[], None]) -> None:

@@ -1,6 +1,7 @@
-"""A small sky drawn in ASCII, and how a moment in it is judged. Times are seconds since the departure of most flights."""
+"""A small sky drawn in ASCII, and how a moment in it is judged. Times are seconds since most flights depart."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -95,6 +96,7 @@ def reserved(
 class Moment:
     """One moment over the city: what flies, where it was seen, and how blocks and aircraft are judged.
 
+    `seen` says who was seen where: the flight with a sequence number, or a track.
     All flights hold their blocks, except those whose sequence numbers are in `released`.
     """
 
@@ -102,7 +104,7 @@ class Moment:
         self,
         time: float,
         flights: Sequence[Flight] = (),
-        seen: Mapping[Who, Sighting] | None = None,
+        seen: Mapping[Any, Sighting] | None = None,
         *,
         rule: OccupancyRule = OccupancyRule.CONTAINMENT,
         released: Sequence[int] = (),

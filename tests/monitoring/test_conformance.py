@@ -104,6 +104,10 @@ def test_where_a_path_passes_twice_the_nearer_time_tells_whether_a_flight_is_ear
     assert judged(at("A", 37), 37, way=there_and_back) == ("deviating", "early")
 
 
+def test_a_flight_that_comes_back_above_its_path_is_late_below_rather_than_in_the_wrong_layer() -> None:
+    assert judged(at("B", 35), 35, way="ABCcb") == ("deviating", "late")
+
+
 def test_a_climbing_flight_is_early_rather_than_in_the_wrong_layer() -> None:
     assert judged(at("a", 5), 5, way=path("Aab", hover={"A": 30})) == ("deviating", "early")
 
@@ -161,6 +165,7 @@ def test_a_flight_that_was_seen_only_on_its_pad_before_departure_is_missed_when_
     assert judged(at("A", -60, airborne=False), 2) == ("conforming",)
     assert judged(at("A", -60, airborne=False), 2.001) == ("unseen", "not_seen")
     assert judged(at("A", -60), 2.001) == ("unseen", "not_seen")
+    assert judged(at("A", -2.999), 2.001) == ("conforming",)
 
 
 # On the ground
@@ -239,7 +244,7 @@ def test_a_refused_flight_that_flies_deviates() -> None:
 
 @pytest.mark.parametrize("state", [State.CANCELLED, State.ENDED])
 def test_a_flight_that_has_given_its_blocks_back_and_flies_deviates(state: State) -> None:
-    over = flight("ABCDE", state=state)
+    over = flight("ABCDE", state=state, activated=False)
     assert Moment(12, [over], {1: at("B", 12)}, released=[1]).says(1) == ("deviating", "not_accepted")
     assert Moment(12, [over], {1: at("B", 12)}).says(1) == ("conforming",)
 

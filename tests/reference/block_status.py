@@ -18,7 +18,7 @@ OPEN = {"accepted", "activated", "nonconforming", "contingent"}
 
 
 class Keeping(NamedTuple):
-    """How an aircraft keeps to its plan, why it does not (each of these is as good a reason), and the block it is in."""
+    """How an aircraft keeps to its plan, why not (each of these is as good a reason), and the block it is in."""
 
     conformance: str
     reasons: frozenset[str] = frozenset()
@@ -58,9 +58,7 @@ def keeping(picture: AirPicture, grid: AirMatrix, thresholds: Thresholds) -> dic
     return kept
 
 
-def uses(
-    picture: AirPicture, kept: dict[Aircraft, Keeping], occupied: BoolArray
-) -> dict[int, Use]:
+def uses(picture: AirPicture, kept: dict[Aircraft, Keeping], occupied: BoolArray) -> dict[int, Use]:
     """Return the status of each block that is not idle."""
     used = {}
     for block in range(len(occupied)):

@@ -1,0 +1,71 @@
+"""The README's pictures, made anew on request:
+
+AIRMATRIX_SCREENSHOTS=1 .venv/bin/pytest tests/console/test_screenshots.py
+"""
+
+import os
+import re
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.cli.serving import AIRMATRIX, environment
+from tests.console.browser import Theme, Watched
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+_DOCS = Path(__file__).parents[2] / "docs"
+_SIZE = (1440, 900)
+_TRAFFIC_MS = 180_000
+
+pytestmark = pytest.mark.skipif(
+    "AIRMATRIX_SCREENSHOTS" not in os.environ, reason="pictures are made where AIRMATRIX_SCREENSHOTS is set"
+)
+
+
+def test_screenshots(browser: "Browser", tmp_path: Path) -> None:
+    with demonstration(tmp_path) as url:
+        draw(browser, url, "dark", close=True)
+        draw(browser, url, "light", close=False)
+
+
+@contextmanager
+def demonstration(folder: Path) -> Iterator[str]:
+    """Run `airmatrix demo` and yield its address."""
+    log = folder / "demo.log"
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [AIRMATRIX, "demo", "--port", "0", "--flights", "160"],
+            cwd=folder, env=environment(), stdout=output, stderr=output,
+        )  # fmt: skip
+    try:
+        while not (named := re.search(r"http://127\.0\.0\.1:\d+", log.read_text())):
+            assert process.poll() is None, log.read_text()
+        yield named[0]
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def draw(browser: "Browser", url: str, theme: Theme, *, close: bool) -> None:
+    """Write a picture of the whole airspace, or of the place of an alert that threatens others."""
+    console = Watched(browser, url, theme=theme, size=_SIZE)
+    console.live()
+    page = console.page
+    page.locator("#count-flights b").filter(has_text=re.compile(r"^\d{2,}")).wait_for(timeout=_TRAFFIC_MS)
+    urgent = page.locator('#alerts-list button[data-status="red"]', has_text="reaches").first
+    urgent.wait_for(timeout=_TRAFFIC_MS)
+    page.wait_for_timeout(15_000)
+    if close:
+        urgent.click()
+        page.locator("#details tbody tr").first.wait_for()
+        page.click("#tab-alerts")
+    page.wait_for_timeout(3_000)
+    page.screenshot(path=_DOCS / f"console-{theme}.png")
+    assert console.complaints == []
+    console.close()

@@ -1,0 +1,42 @@
+"""The event stream is lost and comes back: the console says so, and shows what is true then."""
+
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tests.cli.serving import started
+from tests.console.browser import PATIENCE_MS, Watched
+from tests.console.quarter import quarter
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+# The service starts meanwhile, and the console waits up to eight seconds between its attempts.
+_RETURN_MS = 3 * PATIENCE_MS
+
+
+def test_loss_and_return_of_the_stream_are_shown(browser: "Browser", tmp_path: Path) -> None:
+    with quarter(tmp_path) as served:
+        served.fly((0, 2, 0), (10, 2, 0), reference="STAYS")
+        console = Watched(browser, served.url)
+        page = console.page
+        console.live()
+        page.click("#tab-flights")
+        page.locator("#flights-list strong", has_text="STAYS").wait_for()
+        assert page.locator("#stale").is_hidden()
+        port = served.url.rpartition(":")[2]
+        served.server.stop(signal.SIGTERM)
+
+        page.wait_for_selector('#link[data-state="reconnecting"]')
+        page.locator("#stale", has_text="Stale since").wait_for()
+        assert "connecting again" in page.locator("#stale").inner_text()
+        # What was known last is still there.
+        assert page.locator("#flights-list strong", has_text="STAYS").count() == 1
+
+        airspace = str(tmp_path / "quarter.geojson")
+        with started(tmp_path, "--port", port, "--airspace", airspace, log="again.log"):
+            page.wait_for_selector('#link[data-state="live"]', timeout=_RETURN_MS)
+            page.locator("#stale").wait_for(state="hidden")
+            served.fly((0, 9, 0), (10, 9, 0), reference="COMES")
+            page.locator("#flights-list strong", has_text="COMES").wait_for()
+        console.close()
