@@ -148,7 +148,9 @@ def _flight(
         return Assessment(aircraft, flight, None, Conformance.UNSEEN, reasons)
     is_fresh = now - sighting.time_ms <= thresholds.freshness_ms
     if not is_airborne(flight, sighting):
-        return _on_the_ground(aircraft, flight, sighting, is_due=is_due, is_fresh=is_fresh, tolerance_ms=tolerance_ms)
+        return _on_the_ground(
+            aircraft, flight, sighting, is_due=is_due, is_fresh=is_fresh, is_on_reservation=is_on_reservation
+        )
     if not is_fresh:
         if path is not None and _reached_its_end(path, sighting) and now > path.depart_ms[-1] + tolerance_ms:
             return Assessment(aircraft, flight, sighting, Conformance.CONFORMING)
@@ -163,22 +165,21 @@ def _flight(
 
 
 def _on_the_ground(
-    aircraft: Aircraft, flight: Flight, sighting: Sighting, *, is_due: bool, is_fresh: bool, tolerance_ms: int
+    aircraft: Aircraft, flight: Flight, sighting: Sighting, *, is_due: bool, is_fresh: bool, is_on_reservation: bool
 ) -> Assessment:
+    own, reason = Conformance.CONFORMING, None
     path = flight.path
-    if path is None or sighting.time_ms < path.arrive_ms[0] or flight.state not in OPEN_STATES:
-        if is_due and not is_fresh and flight.state in OPEN_STATES:
-            return Assessment(aircraft, flight, sighting, Conformance.UNSEEN, (Reason.NOT_SEEN,))
-        return Assessment(aircraft, flight, sighting, Conformance.CONFORMING, is_fresh=is_fresh)
-    if sighting.block == path.blocks[-1]:
-        return Assessment(aircraft, flight, sighting, Conformance.CONFORMING, is_fresh=is_fresh)
-    if sighting.block != path.blocks[0]:
-        return Assessment(aircraft, flight, sighting, Conformance.DEVIATING, (Reason.OFF_TRACK,), is_fresh=is_fresh)
-    if sighting.time_ms <= path.arrive_ms[0] + tolerance_ms:
-        reasons = (Reason.NOT_SEEN,) if is_due and not is_fresh else ()
-        conformance = Conformance.UNSEEN if reasons else Conformance.CONFORMING
-        return Assessment(aircraft, flight, sighting, conformance, reasons, is_fresh=is_fresh)
-    return Assessment(aircraft, flight, sighting, Conformance.DEVIATING, (Reason.LATE,), is_fresh=is_fresh)
+    if path is not None and flight.state in OPEN_STATES:
+        is_before = sighting.time_ms < path.arrive_ms[0]
+        has_arrived = sighting.block == path.blocks[-1] and not is_before
+        is_right = has_arrived or (is_fresh and (is_before or is_on_reservation))
+        if not is_right and not is_before and sighting.block != path.blocks[0]:
+            own, reason = Conformance.DEVIATING, Reason.OFF_TRACK
+        elif not is_right and is_fresh:
+            own, reason = Conformance.DEVIATING, Reason.LATE
+        elif not is_right and is_due:
+            own, reason = Conformance.UNSEEN, Reason.NOT_SEEN
+    return Assessment(aircraft, flight, sighting, own, () if reason is None else (reason,), is_fresh=is_fresh)
 
 
 def is_airborne(flight: Flight, sighting: Sighting) -> bool:

@@ -92,9 +92,7 @@ def parse_deviations(text: str, kinds: str, seed: int) -> Deviations:
 def summary(report: Report) -> str:
     """Return how it goes, in one line."""
     latest = sorted(report.latency_ms[-60:])
-    parts = [f"{report.in_air} in the air", f"{report.arrived} arrived"]
-    if report.seconds:
-        parts.append(f"{report.accepted / report.seconds:.0f} positions/s")
+    parts = [f"{report.in_air} in the air", f"{report.arrived} arrived", f"{_rate(report):.0f} positions/s"]
     if latest:
         parts.append(f"{latest[len(latest) // 2]:.0f} ms")
     parts += [f"{number} {kind}" for kind, number in sorted(report.deviating.items())]
@@ -109,7 +107,8 @@ def summary(report: Report) -> str:
 def print_report(report: Report, rate: float) -> None:
     """Print what was measured."""
     table = Table(title=f"flown at {rate:g} s a second", show_header=False, title_justify="left")
-    table.add_row("positions accepted", f"{report.accepted} in {report.seconds:.1f} s, {_rate(report):.1f}/s")
+    sent = f"{report.accepted} in {report.seconds:.1f} s, {_rate(report):.1f}/s, at most {report.most_at_once} at once"
+    table.add_row("positions accepted", sent)
     table.add_row("aircraft", f"{report.arrived} arrived, at most {report.most_in_air} in the air at a time")
     for kind, number in sorted(report.deviating.items()):
         table.add_row(f"deviating: {kind}", str(number))

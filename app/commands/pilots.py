@@ -98,6 +98,7 @@ class Report:
     """What has been measured so far: of the service, and of what was flown."""
 
     accepted: int = 0
+    most_at_once: int = 0
     in_air: int = 0
     most_in_air: int = 0
     arrived: int = 0
@@ -317,6 +318,7 @@ class Pilots:
                 self.report.deviating[aircraft.flown.kind.value] += 1
         heard = [aircraft for aircraft in self._flying.values() if aircraft.flown.is_heard(time_ms)]
         positions = self._positions(heard, time_ms)
+        self.report.most_at_once = max(self.report.most_at_once, len(positions))
         told: set[str] = set()
         for start in range(0, len(heard), _BATCH):
             batch = slice(start, start + _BATCH)

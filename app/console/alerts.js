@@ -69,6 +69,7 @@ function threatWords(threats, nameOf) {
   }
   const [most, ...others] = [...first.values()].sort((one, other) => one.reach_s - other.reach_s);
   if (!most) return "";
-  const words = `reaches ${nameOf(most.flight_intent_id)} at [${most.block.join(", ")}] in ${Math.round(most.reach_s)} s`;
+  const when = most.reach_s < 1 ? "now" : `in ${Math.round(most.reach_s)} s`;
+  const words = `reaches ${nameOf(most.flight_intent_id)} at [${most.block.join(", ")}] ${when}`;
   return others.length ? `${words}, then ${others.map(({ flight_intent_id: id }) => nameOf(id)).join(", ")}` : words;
 }

@@ -119,8 +119,8 @@ export class CityMap {
 
   /** Return the camera that sees the whole airspace. MapLibre fits bounds as if seen from above, which leaves room. */
   #home() {
-    // Room for the cards at the left.
-    const above = this.#map.cameraForBounds(this.#bounds, { padding: { left: 110, top: 0, right: 0, bottom: 0 } });
+    // Room for the cards at the left, and in front, where the tilted view is nearer.
+    const above = this.#map.cameraForBounds(this.#bounds, { padding: { left: 110, top: 0, right: 0, bottom: 80 } });
     return { center: above.center, zoom: above.zoom + 0.08, pitch: 50, bearing: -14 };
   }
 

@@ -13,7 +13,7 @@ import { flightName, flightReason } from "/console/words.js";
 const VECTOR_S = 10;
 const REACH_PX = 16;
 const MOST_TAGS = 24;
-const TAG_PX = { width: 170, height: 38 };
+const TAG_PX = { width: 210, height: 38 };
 const RANK = { violating: 0, deviating: 1, lost: 2, unseen: 3 };
 
 export class Traffic {

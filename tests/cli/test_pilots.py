@@ -197,8 +197,9 @@ def test_what_is_over_or_was_refused_is_not_flown() -> None:
 
 def test_all_aircraft_of_a_tick_go_in_one_request() -> None:
     service = StandIn([intent(number, 15, row=number) for number in range(1, 9)])
-    fly(service)
+    report = fly(service)
     assert max(len(positions) for positions in service.reports) == 8
+    assert report.most_at_once == 8
     for positions in service.reports:
         assert len({position["time"] for position in positions}) == 1
         assert len({position["flight_intent_id"] for position in positions}) == len(positions)

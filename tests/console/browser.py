@@ -11,11 +11,12 @@ import numpy.typing as npt
 from PIL import Image
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, FloatRect, Page
 
 _FLAGS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-    "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
 )  # fmt: skip
 # Software WebGL on a busy machine takes its time.
 PATIENCE_MS = 20_000
@@ -75,7 +76,9 @@ class Watched:
         """Return what the map shows right of its cards, rows of red, green and blue."""
         box = self.page.locator("#map").bounding_box()
         assert box is not None
-        clip = {"x": box["x"] + 230, "y": box["y"] + 10, "width": box["width"] - 300, "height": box["height"] - 60}
+        clip: FloatRect = {
+            "x": box["x"] + 230, "y": box["y"] + 10, "width": box["width"] - 300, "height": box["height"] - 60,
+        }  # fmt: skip
         # Name tags are coloured too.
         self.run("() => document.getElementById('tags').style.visibility = 'hidden'")
         image = self.page.screenshot(clip=clip)

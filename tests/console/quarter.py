@@ -28,9 +28,11 @@ SLOW = {"AIRMATRIX_CLOCK_START": "2026-11-22T08:00:00Z", "AIRMATRIX_CLOCK_RATE":
 @contextmanager
 def quarter(folder: Path, **variables: str) -> Iterator["Quarter"]:
     """Serve the quarter from a folder."""
-    with serving(folder, "--airspace", str(airspace(folder)), **variables) as server:
-        with httpx.Client(base_url=server.url, timeout=20.0) as http:
-            yield Quarter(server, http)
+    with (
+        serving(folder, "--airspace", str(airspace(folder)), **variables) as server,
+        httpx.Client(base_url=server.url, timeout=20.0) as http,
+    ):
+        yield Quarter(server, http)
 
 
 def airspace(folder: Path) -> Path:

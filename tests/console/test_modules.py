@@ -103,10 +103,12 @@ def picture(modules: Watched, steps: str) -> Any:
             const picture = new Picture(() => at);
             const clock = { now: "2026-11-22T08:00:00.000Z", rate: 4, simulated: true };
             const entry = (i, status) => ({ block: [i, 0, 0], status });
-            const status = (full, blocks, idle = []) => picture.take("status", { clock, full, counts: {}, blocks, idle });
+            const status = (full, blocks, idle = []) =>
+                picture.take("status", { clock, full, counts: {}, blocks, idle });
             const wait = (ms) => { at += ms; };
             const log = [];
-            const show = () => log.push([[...picture.blocks].map(([key, { status }]) => `${key} ${status}`), picture.state]);
+            const words = () => [...picture.blocks].map(([key, { status }]) => `${key} ${status}`);
+            const show = () => log.push([words(), picture.state]);
             STEPS
             return log;
         }""".replace("STEPS", steps)
@@ -192,7 +194,8 @@ def test_flights_are_placed_by_plan_at_any_time(modules: Watched) -> None:
     found = modules.run(
         """async ([trajectory, seconds]) => {
             const { plannedAt } = await import("/console/planned.js");
-            return seconds.map((second) => plannedAt(trajectory, Date.parse("2026-11-22T08:00:00Z") + second * 1000)?.lon ?? null);
+            const start = Date.parse("2026-11-22T08:00:00Z");
+            return seconds.map((second) => plannedAt(trajectory, start + second * 1000)?.lon ?? null);
         }""",
         [[waypoint(0, 2, 4), waypoint(1, 6, 8), waypoint(3, 10, 10)], [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]],
     )
@@ -204,7 +207,8 @@ def test_the_scene_counts_in_metres_from_its_origin(modules: Watched) -> None:
         """async () => {
             const { LocalFrame } = await import("/console/frame.js");
             const frame = new LocalFrame(71.4, 51.1);
-            return [frame.local({ lon: 71.4, lat: 51.1, alt_m: 33 }), frame.local({ lon: 71.41, lat: 51.11, alt_m: 0 })];
+            const there = { lon: 71.41, lat: 51.11, alt_m: 0 };
+            return [frame.local({ lon: 71.4, lat: 51.1, alt_m: 33 }), frame.local(there)];
         }"""
     )
     assert local[0] == pytest.approx([0, 0, 33], abs=1e-6)

@@ -40,7 +40,7 @@ def demonstration(folder: Path) -> Iterator[str]:
     log = folder / "demo.log"
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [AIRMATRIX, "demo", "--port", "0", "--flights", "160"],
+            [AIRMATRIX, "demo", "--port", "0", "--flights", "160", "--rate", "2"],
             cwd=folder, env=environment(), stdout=output, stderr=output,
         )  # fmt: skip
     try:
@@ -53,19 +53,18 @@ def demonstration(folder: Path) -> Iterator[str]:
 
 
 def draw(browser: "Browser", url: str, theme: Theme, *, close: bool) -> None:
-    """Write a picture of the whole airspace, or of the place of an alert that threatens others."""
+    """Write a picture of the whole airspace, or of the place of a violation that threatens another flight."""
     console = Watched(browser, url, theme=theme, size=_SIZE)
     console.live()
     page = console.page
-    page.locator("#count-flights b").filter(has_text=re.compile(r"^\d{2,}")).wait_for(timeout=_TRAFFIC_MS)
-    urgent = page.locator('#alerts-list button[data-status="red"]', has_text="reaches").first
-    urgent.wait_for(timeout=_TRAFFIC_MS)
-    page.wait_for_timeout(15_000)
+    page.locator("#count-flights b").filter(has_text=re.compile(r"^\d{3}")).wait_for(timeout=_TRAFFIC_MS)
+    violation = page.locator('#alerts-list button[data-status="red"]', has_text="violating").filter(has_text="reaches")
+    violation.first.wait_for(timeout=_TRAFFIC_MS)
     if close:
-        urgent.click()
+        violation.first.click()
         page.locator("#details tbody tr").first.wait_for()
         page.click("#tab-alerts")
-    page.wait_for_timeout(3_000)
+    page.wait_for_timeout(1_000)
     page.screenshot(path=_DOCS / f"console-{theme}.png")
     assert console.complaints == []
     console.close()

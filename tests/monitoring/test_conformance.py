@@ -176,9 +176,9 @@ def test_a_flight_conforms_on_any_ground_before_its_departure() -> None:
     assert judged(at("N", -1, airborne=False), -1) == ("conforming",)
 
 
-def test_a_flight_that_still_stands_on_its_pad_after_its_departure_is_late() -> None:
-    assert judged(at("A", 2, airborne=False), 2) == ("conforming",)
-    assert judged(at("A", 2.001, airborne=False), 2.001) == ("deviating", "late")
+def test_a_flight_that_still_stands_on_its_pad_when_that_is_no_longer_reserved_is_late() -> None:
+    assert judged(at("A", 12, airborne=False), 12) == ("conforming",)
+    assert judged(at("A", 12.001, airborne=False), 12.001) == ("deviating", "late")
 
 
 def test_a_flight_that_stands_at_its_destination_conforms() -> None:

@@ -109,12 +109,7 @@ def _flying(
             and picture.at_ms > path.depart_ms[-1] + tolerance
         )
         return Keeping("conforming") if has_landed else Keeping("lost", frozenset({"lost"}))
-    is_on_its_own = any(
-        sequence == flight.sequence and block == sighting.block
-        and enter - tolerance <= sighting.time_ms < leave + tolerance
-        for block, enter, leave, sequence in _reservations(picture)
-    )  # fmt: skip
-    if is_on_its_own and path is not None:
+    if path is not None and _is_on_its_own(picture, flight, sighting, thresholds):
         is_unactivated = flight.state in OPEN and flight.activated_ms is None
         return Keeping(
             "conforming", frozenset({"not_activated"} if is_unactivated else ()), _on_trajectory(path, picture.at_ms)
@@ -128,16 +123,27 @@ def _standing(picture: AirPicture, flight: Flight, sighting: Sighting, threshold
     path = flight.path
     if path is None or flight.state not in OPEN:
         return Keeping("conforming")
-    departure, latest = path.arrive_ms[0], path.arrive_ms[0] + thresholds.tolerance_ms
-    has_flown = sighting.time_ms >= departure and sighting.block != path.blocks[0]
-    if has_flown:
-        is_there = sighting.block == path.blocks[-1]
-        return Keeping("conforming") if is_there else Keeping("deviating", frozenset({"off_track"}))
-    if sighting.time_ms > latest:
+    departure = path.arrive_ms[0]
+    if sighting.time_ms >= departure and sighting.block == path.blocks[-1]:
+        return Keeping("conforming")
+    is_fresh = _is_fresh(picture, sighting, thresholds)
+    if is_fresh and (sighting.time_ms < departure or _is_on_its_own(picture, flight, sighting, thresholds)):
+        return Keeping("conforming")
+    if sighting.time_ms >= departure and sighting.block != path.blocks[0]:
+        return Keeping("deviating", frozenset({"off_track"}))
+    if is_fresh:
         return Keeping("deviating", frozenset({"late"}))
-    if _is_expected(picture, flight, thresholds) and not _is_fresh(picture, sighting, thresholds):
-        return Keeping("unseen", frozenset({"not_seen"}))
-    return Keeping("conforming")
+    is_missed = _is_expected(picture, flight, thresholds)
+    return Keeping("unseen", frozenset({"not_seen"})) if is_missed else Keeping("conforming")
+
+
+def _is_on_its_own(picture: AirPicture, flight: Flight, sighting: Sighting, thresholds: Thresholds) -> bool:
+    """Tell whether a position lies in a reservation of its flight at its own time, give or take the tolerance."""
+    return any(
+        sequence == flight.sequence and block == sighting.block
+        and enter - thresholds.tolerance_ms <= sighting.time_ms < leave + thresholds.tolerance_ms
+        for block, enter, leave, sequence in _reservations(picture)
+    )  # fmt: skip
 
 
 def _is_fresh(picture: AirPicture, sighting: Sighting, thresholds: Thresholds) -> bool:
