@@ -95,7 +95,8 @@ def summary(report: Report) -> str:
     parts = [f"{report.in_air} in the air", f"{report.arrived} arrived", f"{_rate(report):.0f} positions/s"]
     if latest:
         parts.append(f"{latest[len(latest) // 2]:.0f} ms")
-    parts += [f"{number} {kind}" for kind, number in sorted(report.deviating.items())]
+    if report.deviating:
+        parts.append("deviating: " + ", ".join(f"{number} {kind}" for kind, number in sorted(report.deviating.items())))
     parts += [f"refused: {number} {reason}" for reason, number in report.refused.most_common(2)]
     if report.skipped:
         parts.append(f"{report.skipped} ticks skipped: the service is slow")

@@ -4,7 +4,8 @@ import signal
 import subprocess
 import threading
 import time
-from collections import defaultdict
+from array import array
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,6 +15,8 @@ import pytest
 
 from app.block_status import Status
 from app.client import Client
+from app.commands.fly import summary
+from app.commands.pilots import Report
 from app.flight_intents import State
 from app.routes.flight_intents import FlightIntentAnswer
 from app.times import now_ms
@@ -172,3 +175,16 @@ def test_a_kind_that_does_not_exist_is_refused_by_name(airmatrix: Run) -> None:
 )
 def test_an_option_outside_its_bounds_is_refused(airmatrix: Run, option: str, value: str) -> None:
     airmatrix("fly", option, value).assert_misused(option)
+
+
+def test_the_live_line_says_how_it_goes() -> None:
+    report = Report(
+        accepted=500, in_air=3, arrived=2, skipped=4, latency_ms=array("d", [90, 10, 20]), seconds=10.0,
+        refused=Counter({"position-out-of-order": 7}), deviating=Counter({"late": 1, "drift": 2}),
+        unanswered=Counter({"no answer": 1}),
+    )  # fmt: skip
+    assert summary(report) == (
+        "3 in the air · 2 arrived · 50 positions/s · 20 ms · deviating: 2 drift, 1 late · "
+        "refused: 7 position-out-of-order · 4 ticks skipped: the service is slow · 1 requests unanswered"
+    )
+    assert summary(Report()) == "0 in the air · 0 arrived · 0 positions/s"

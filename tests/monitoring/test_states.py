@@ -60,7 +60,7 @@ def test_an_activated_flight_that_conforms_stays_activated() -> None:
     assert moved(eastbound(State.ACTIVATED), at("B", 12), 12) is None
 
 
-@pytest.mark.parametrize("sighting", [at("N", 12), at("E", 12), at("B", 7.5), at("A", 12.001, airborne=False)])
+@pytest.mark.parametrize("sighting", [at("N", 12), at("E", 12), at("B", 6.999), at("A", 12.001, airborne=False)])
 def test_an_activated_flight_that_deviates_or_is_lost_is_nonconforming(sighting: Sighting) -> None:
     assert moved(eastbound(State.ACTIVATED), sighting, 12.001) is State.NONCONFORMING
 
