@@ -46,7 +46,8 @@ class Way:
 
     def at(self, time_ms: int) -> FloatArray:
         """Return the place at a time: shape (3,)."""
-        return places([self], time_ms)[0]
+        place: FloatArray = places([self], time_ms)[0]
+        return place
 
     def delayed(self, by_ms: int) -> "Way":
         """Return the same way, flown later."""

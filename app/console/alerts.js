@@ -10,6 +10,8 @@ export class AlertsPanel {
   #onChoose;
   /** Ids that were there before; null until the first picture, whose alerts are no news. */
   #known = null;
+  /** The id of the selected flight or track, or null. */
+  selected = null;
 
   /** `onChoose` gets the alert that was clicked. */
   constructor(list, announcer, onChoose) {
@@ -23,13 +25,15 @@ export class AlertsPanel {
   show(alerts, nowMs, nameOf) {
     this.#announce(alerts);
     if (alerts.length === 0) {
-      this.#list.replaceChildren(element("li", { class: "hint", text: "No alerts: every aircraft is where it should be." }));
+      const calm = element("li", { class: "hint", text: "No alerts: every aircraft is where it should be." });
+      this.#list.replaceChildren(calm);
       return;
     }
     showList(this.#list, alerts, (alert) => alert.id, () => this.#item(), (item, alert) => {
       const [button] = item.children;
       item.alert = alert;
       button.dataset.status = alert.severity;
+      button.ariaCurrent = String((alert.flight_intent_id ?? alert.track_id) === this.selected);
       const [, title, when, message, reasons, threats] = button.children;
       setText(title, alert.flight_intent_id ? nameOf(alert.flight_intent_id) : `track ${alert.track_id}`);
       setText(when, relative(Date.parse(alert.raised), nowMs));
@@ -53,8 +57,9 @@ export class AlertsPanel {
   }
 
   #announce(alerts) {
-    const news = this.#known === null ? [] : alerts.filter((alert) => !this.#known.has(`${alert.id} ${alert.severity}`));
-    this.#known = new Set(alerts.map((alert) => `${alert.id} ${alert.severity}`));
+    const key = ({ id, severity }) => `${id} ${severity}`;
+    const news = this.#known === null ? [] : alerts.filter((alert) => !this.#known.has(key(alert)));
+    this.#known = new Set(alerts.map(key));
     if (news.length === 1) setText(this.#announcer, `${news[0].severity} alert: ${news[0].message}`);
     if (news.length > 1) setText(this.#announcer, `${news.length} new alerts. ${news[0].message}`);
   }

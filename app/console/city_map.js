@@ -76,7 +76,10 @@ export class CityMap {
       features: entries.map(({ block, status }) => ({
         type: "Feature",
         properties: {
-          status, key: keyOf(block), base: block[2] * this.#grid.height + 1, top: (block[2] + 1) * this.#grid.height - 1,
+          status,
+          key: keyOf(block),
+          base: block[2] * this.#grid.height + 1,
+          top: (block[2] + 1) * this.#grid.height - 1,
         },
         geometry: { type: "Polygon", coordinates: [this.#ring(block)] },
       })),

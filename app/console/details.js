@@ -7,7 +7,7 @@ import { symbolCanvas, symbolOf } from "/console/symbols.js";
 import { clockTime, relative, span } from "/console/time.js";
 import { CONFORMANCE_WORDS, STATUS_WORDS, blockReason, flightName, flightReason, standing } from "/console/words.js";
 
-const HINT = "Click a block, an aircraft or an alert to see its status, the reasons for it, its path and its reservations.";
+const HINT = "Click a block, an aircraft or an alert to see its status, the reasons, its path and its reservations.";
 const SHOWN = 60;
 
 export class Details {
@@ -122,14 +122,15 @@ export class Details {
       ...flight.reasons.map((slug) => element("li", { "data-reason": slug, text: flightReason(slug) })));
     place.replaceChildren(
       element("p", { class: "conformance", "data-conformance": stands },
-        symbolCanvas(symbolOf(flight), this.#colours, 26), element("strong", { text: CONFORMANCE_WORDS[stands] }),
-        flight.since && !["conforming", "scheduled"].includes(stands) ? ` since ${clockTime(Date.parse(flight.since))} UTC` : ""),
+        symbolCanvas(symbolOf(flight), this.#colours, 26),
+        element("strong", { text: CONFORMANCE_WORDS[stands] }),
+        flight.since && flight.reasons.length ? ` since ${clockTime(Date.parse(flight.since))} UTC` : ""),
       reasons,
       facts([
         ["Altitude", position && `${position.alt_m.toFixed(0)} m`],
         ["Speed", velocity && `${Math.hypot(velocity.east, velocity.north).toFixed(1)} m/s, ${climb(velocity.up)}`],
         ["Block", position?.block ? `[${position.block.join(", ")}]` : null],
-        ["Last position", position === null ? "never reported" : `${position.age_s < 10 ? `${position.age_s.toFixed(1)} s` : span(position.age_s)} old`],
+        ["Last position", position === null ? "never reported" : `${age(position.age_s)} old`],
         ["Airborne", position?.airborne === true ? "yes" : position?.airborne === false ? "no, on the ground" : null],
         ["Jump", position?.flagged ? "the last position is an implausible jump" : null],
       ]));
@@ -142,7 +143,7 @@ export class Details {
       ["Departure", time(intent.departure)],
       ["Arrival", time(intent.arrival)],
       ["Flight time", span(intent.flight_time_s)],
-      ["Delay", `${intent.delay_s.toFixed(1)} s (held on the ground ${intent.ground_hold_s.toFixed(1)} s, hovering ${intent.hover_s.toFixed(1)} s)`],
+      ["Delay", delayWords(intent)],
     ];
     return [
       facts([
@@ -165,7 +166,8 @@ export class Details {
     ];
     return [
       element("p", {}, statusChip(status, `${status}: ${STATUS_WORDS[status]}`)),
-      element("ul", { class: "reasons" }, ...reasons.map((slug) => element("li", { "data-reason": slug, text: blockReason(slug) }))),
+      element("ul", { class: "reasons" },
+        ...reasons.map((slug) => element("li", { "data-reason": slug, text: blockReason(slug) }))),
       facts([["Layer", this.#grid.layerName(block[2])]]),
       users.length ? element("p", { class: "users" }, ...users.map((user) => this.#userLink(user))) : null,
     ].filter(Boolean);
@@ -184,24 +186,34 @@ export class Details {
 
   #table(heads, rows, cells) {
     const shown = rows.slice(0, SHOWN);
-    const table = element("table", {},
-      element("thead", {}, element("tr", {}, ...heads.map((head) => element("th", { scope: "col", text: head })))),
-      element("tbody", {}, ...shown.map((row) => element("tr", {}, ...cells(row).map((cell) => element("td", {}, cell))))));
+    const head = element("tr", {}, ...heads.map((text) => element("th", { scope: "col", text })));
+    const body = shown.map((row) => element("tr", {}, ...cells(row).map((cell) => element("td", {}, cell))));
+    const table = element("table", {}, element("thead", {}, head), element("tbody", {}, ...body));
     const more = rows.length - shown.length;
     return element("div", {}, table, more ? element("p", { class: "hint", text: `${more} more` }) : null);
   }
 
   #blockLink(block) {
-    return element("button", {
-      type: "button", class: "link", text: `[${block.join(", ")}]`, onclick: () => this.#actions.choose({ kind: "block", block }),
-    });
+    return this.#link(`[${block.join(", ")}]`, { kind: "block", block });
   }
 
   #userLink({ kind, id }) {
     const flight = this.#actions.flight(id);
-    const text = flight ? flightName(flight) : kind === "track" ? `track ${id}` : `flight ${id.slice(-8)}`;
-    return element("button", { type: "button", class: "link", text, onclick: () => this.#actions.choose({ kind, id }) });
+    const unnamed = kind === "track" ? `track ${id}` : `flight ${id.slice(-8)}`;
+    return this.#link(flight ? flightName(flight) : unnamed, { kind, id });
   }
+
+  #link(text, selection) {
+    return element("button", { type: "button", class: "link", text, onclick: () => this.#actions.choose(selection) });
+  }
+}
+
+function age(seconds) {
+  return seconds < 10 ? `${seconds.toFixed(1)} s` : span(seconds);
+}
+
+function delayWords({ delay_s: delay, ground_hold_s: hold, hover_s: hover }) {
+  return `${delay.toFixed(1)} s (held on the ground ${hold.toFixed(1)} s, hovering ${hover.toFixed(1)} s)`;
 }
 
 function climb(up) {

@@ -13,7 +13,8 @@ export class Filters {
   constructor({ layers, statuses, heat, span, options }, grid, onChange) {
     this.#layers = switches(layers, Array.from({ length: grid.dimensions[2] }, (_, k) => k).reverse(),
       (layer) => grid.layerName(layer), onChange);
-    this.#statuses = switches(statuses, ["red", "yellow", "green"], (status) => statusChip(status, STATUS_WORDS[status]), onChange);
+    this.#statuses = switches(statuses, ["red", "yellow", "green"],
+      (status) => statusChip(status, STATUS_WORDS[status]), onChange);
     this.#heat = heat;
     this.#span = span;
     heat.addEventListener("change", () => {

@@ -15,6 +15,8 @@ export class FlightsPanel {
   #onChoose;
   #colours;
   #flights = [];
+  /** The id of the selected flight or track, or null. */
+  selected = null;
 
   /** `onChoose` gets the flight or track that was clicked. */
   constructor({ list, more, search, conformance }, colours, onChoose) {
@@ -50,7 +52,8 @@ export class FlightsPanel {
     const words = this.#search.value.trim().toLowerCase();
     const conformance = this.#conformance.value;
     if (conformance && standing(flight) !== conformance) return false;
-    const text = [flight.operator, flight.reference, flight.sequence && `#${flight.sequence}`, flight.track_id, flight.aircraft_type];
+    const number = flight.sequence && `#${flight.sequence}`;
+    const text = [flight.operator, flight.reference, number, flight.track_id, flight.aircraft_type];
     return words === "" || text.filter(Boolean).join(" ").toLowerCase().includes(words);
   }
 
@@ -66,6 +69,7 @@ export class FlightsPanel {
 
   #update(item, flight) {
     item.flight = flight;
+    item.firstElementChild.ariaCurrent = String(idOf(flight) === this.selected);
     const [place, name, altitude, message] = item.firstElementChild.children;
     const symbol = symbolOf(flight);
     if (place.dataset.symbol !== symbol) {
@@ -73,12 +77,16 @@ export class FlightsPanel {
       place.replaceChildren(symbolCanvas(symbol, this.#colours));
     }
     setText(name, flightName(flight));
-    const { position } = flight;
-    setText(altitude, position === null ? "" : position.airborne === false ? "on the ground" : `${Math.round(position.alt_m)} m`);
-    const state = flight.reasons.length ? flight.reasons.map(flightReason).join(", ") : CONFORMANCE_WORDS[standing(flight)];
-    setText(message, [state, flight.track_id ? null : flight.operator, flight.sequence && `#${flight.sequence}`, flight.aircraft_type]
-      .filter(Boolean).join(" · "));
+    setText(altitude, altitudeWords(flight.position));
+    const state = flight.reasons.map(flightReason).join(", ") || CONFORMANCE_WORDS[standing(flight)];
+    const number = flight.sequence && `#${flight.sequence}`;
+    setText(message, [state, flight.operator, number, flight.aircraft_type].filter(Boolean).join(" · "));
   }
+}
+
+function altitudeWords(position) {
+  if (position === null) return "";
+  return position.airborne === false ? "on the ground" : `${Math.round(position.alt_m)} m`;
 }
 
 /** Return a flight's or a track's id. */

@@ -1,7 +1,7 @@
 /** The ops console: fetches the airspace once, follows the event stream, and ties map, panels and timeline together. */
 
-import { aborted, get } from "/console/api.js";
 import { AlertsPanel } from "/console/alerts.js";
+import { aborted, get } from "/console/api.js";
 import { CityMap, HEAT_RAMP } from "/console/city_map.js";
 import { Details } from "/console/details.js";
 import { byId, element, navigable, setText, statusChip } from "/console/dom.js";
@@ -13,26 +13,28 @@ import { NewFlight } from "/console/new_flight.js";
 import { palette } from "/console/palette.js";
 import { Picture } from "/console/picture.js";
 import { aircraftAt, blocksAt } from "/console/planned.js";
+import { listenToKeys } from "/console/shortcuts.js";
 import { follow } from "/console/stream.js";
 import { symbolCanvas } from "/console/symbols.js";
 import { startTheme, toggleTheme } from "/console/theme.js";
-import { clockTime, date, span } from "/console/time.js";
+import { clockTime } from "/console/time.js";
 import { Timeline } from "/console/timeline.js";
+import { showAirspace, showCounts, showFailure, showLink } from "/console/top_bar.js";
 import { Traffic } from "/console/traffic.js";
 import { CONFORMANCE_WORDS, STATUS_WORDS, flightName, journalWords } from "/console/words.js";
 
 const TABS = ["alerts", "flights", "details", "new"];
+const WIDE_PX = 1200;
 const FRAME_MS = 33;
-const NOTICE_MS = 8_000;
 const REFRESH_MS = 500;
 const HEAT_MS = 10_000;
+const NOTICE_MS = 8_000;
 
 class Console {
-  #airspace;
+  #picture = new Picture();
   #grid;
   #city;
   #traffic;
-  #picture = new Picture();
   #filters;
   #timeline;
   #alerts;
@@ -41,7 +43,7 @@ class Console {
   #newFlight;
   /** `{kind: "flight" | "track", id}`, `{kind: "block", block}` or null. */
   #selection = null;
-  /** Blocks and counts of a moment other than the present; null while live. */
+  /** `{blocks, counts, flying}` of a moment other than the present; null while live. */
   #moment = null;
   #momentRequest = null;
   #heatRequest = null;
@@ -51,22 +53,22 @@ class Console {
   async start() {
     startTheme(() => this.#paint());
     const [airspace, buildings] = await Promise.all([get("/v1/airspace"), get("/v1/airspace/buildings")]);
-    this.#airspace = airspace;
-    this.#describe();
+    showAirspace(airspace);
     this.#grid = new Grid(airspace);
     this.#city = await CityMap.open(byId("map"), this.#grid, airspace.bounds, buildings);
     const [west, south, east, north] = airspace.bounds;
     const frame = new LocalFrame((west + east) / 2, (south + north) / 2);
     this.#traffic = new Traffic(this.#city.map, frame, this.#grid, palette(), byId("tags"));
+    this.#addControls();
     this.#addPanels();
     this.#addLegend();
-    byId("legend").open = innerWidth >= 1200;
+    byId("legend").open = innerWidth >= WIDE_PX;
     this.#listenToMap();
     this.#listenToKeys();
     this.#listenToPicture();
     this.#openTab("alerts");
     setInterval(() => this.#refresh(), REFRESH_MS);
-    setInterval(() => this.#filters.heatSpan && this.#timeline.moment === null && this.#showHeat(), HEAT_MS);
+    setInterval(() => this.#moment ?? this.#showHeat(), HEAT_MS);
     requestAnimationFrame((at) => this.#animate(at));
     this.#newFlight.load().catch((error) => this.#notice(`Aircraft types: ${error.message}`));
     follow({
@@ -78,28 +80,39 @@ class Console {
 
   // ---- what is on the screen
 
-  #describe() {
-    const { name, attribution, licence } = this.#airspace;
-    setText(byId("airspace-name"), name);
-    document.title = `${name} · AirMatrix`;
-    setText(byId("attribution"), `Data: ${[attribution, licence].filter(Boolean).join(" · ")}`);
+  #addControls() {
+    this.#filters = new Filters({
+      layers: byId("layers"),
+      statuses: byId("statuses"),
+      heat: byId("heat"),
+      span: byId("heat-span"),
+      options: byId("heat-options"),
+    }, this.#grid, () => {
+      this.#showBlocks();
+      this.#showHeat();
+    });
+    document.querySelector(".ramp").style.background = `linear-gradient(to right, ${HEAT_RAMP.join(", ")})`;
+    this.#timeline = new Timeline({
+      slider: byId("moment"),
+      live: byId("live"),
+      earlier: byId("earlier"),
+      later: byId("later"),
+      text: byId("moment-text"),
+    }, () => this.#picture.now, (moment) => this.#showMoment(moment));
+    byId("theme").addEventListener("click", toggleTheme);
+    for (const tab of TABS) byId(`tab-${tab}`).addEventListener("click", () => this.#openTab(tab));
+    navigable(document.querySelector(".tabs"), { next: "ArrowRight", previous: "ArrowLeft" });
   }
 
   #addPanels() {
     const now = () => this.#picture.now;
     const choose = (selection) => this.#choose(selection);
-    this.#filters = new Filters({
-      layers: byId("layers"), statuses: byId("statuses"), heat: byId("heat"), span: byId("heat-span"), options: byId("heat-options"),
-    }, this.#grid, () => {
-      this.#showBlocks();
-      this.#showHeat();
-    });
-    this.#timeline = new Timeline({
-      slider: byId("moment"), live: byId("live"), earlier: byId("earlier"), later: byId("later"), text: byId("moment-text"),
-    }, now, (moment) => this.#showMoment(moment));
     this.#alerts = new AlertsPanel(byId("alerts-list"), byId("announcer"), (alert) => this.#goTo(alert));
     this.#flights = new FlightsPanel({
-      list: byId("flights-list"), more: byId("flights-more"), search: byId("flights-search"), conformance: byId("flights-conformance"),
+      list: byId("flights-list"),
+      more: byId("flights-more"),
+      search: byId("flights-search"),
+      conformance: byId("flights-conformance"),
     }, palette(), (flight) => this.#goTo(flight));
     this.#details = new Details(byId("details"), this.#grid, palette(), {
       choose,
@@ -116,20 +129,15 @@ class Console {
       showEnds: (ends) => this.#traffic.showEnds(ends),
       showPath: (intent, preview) => this.#traffic.showPath(intent.trajectory, intent.reservations, { preview }),
     });
-    for (const tab of TABS) byId(`tab-${tab}`).addEventListener("click", () => this.#openTab(tab));
-    navigable(document.querySelector(".tabs"), { next: "ArrowRight", previous: "ArrowLeft" });
-    byId("theme").addEventListener("click", toggleTheme);
-    byId("help").addEventListener("click", () => byId("help-dialog").showModal());
   }
 
   #addLegend() {
     const colours = palette();
-    byId("legend-list").replaceChildren(
-      ...Object.entries(STATUS_WORDS).filter(([status]) => status !== "idle")
-        .map(([status, words]) => element("li", {}, statusChip(status, `block ${words}`))),
-      ...Object.entries(CONFORMANCE_WORDS).map(([symbol, words]) =>
-        element("li", {}, symbolCanvas(symbol, colours, 20), `aircraft ${words}`)),
-      element("li", {}, symbolCanvas("planned", colours, 20), "aircraft by plan"));
+    const blocks = ["green", "yellow", "red"].map((status) => statusChip(status, `block ${STATUS_WORDS[status]}`));
+    const aircraft = [...Object.entries(CONFORMANCE_WORDS), ["planned", "by plan"]].map(([symbol, words]) =>
+      [symbolCanvas(symbol, colours), `aircraft ${words}`]);
+    byId("legend-list").replaceChildren(...[...blocks.map((chip) => [chip]), ...aircraft].map((parts) =>
+      element("li", {}, ...parts)));
   }
 
   #openTab(tab) {
@@ -142,8 +150,9 @@ class Console {
     this.#showLists();
   }
 
+  /** Take the colours of another theme. */
   #paint() {
-    if (!this.#traffic) return;
+    if (!this.#newFlight) return;
     const colours = palette();
     this.#city.setTheme();
     this.#traffic.setColours(colours);
@@ -181,8 +190,9 @@ class Console {
 
   #showLists() {
     const { alerts, flights, now } = this.#picture;
+    const worst = alerts.some(({ severity }) => severity === "red") ? "red" : "yellow";
     setText(byId("alerts-count"), String(alerts.length));
-    byId("alerts-count").dataset.status = alerts.some(({ severity }) => severity === "red") ? "red" : alerts.length ? "yellow" : "";
+    byId("alerts-count").dataset.status = alerts.length ? worst : "";
     setText(byId("flights-count"), String(flights.length));
     if (now !== null) this.#alerts.show(alerts, now, (id) => this.#names.get(id) ?? `flight ${id.slice(-8)}`);
     if (!byId("flights").hidden) this.#flights.show(flights);
@@ -190,68 +200,43 @@ class Console {
 
   /** Write what time and the connection change. */
   #refresh() {
-    const { now, rate, simulated, state, silentSeconds, flights } = this.#picture;
-    if (now !== null) {
-      setText(byId("clock-time"), clockTime(now));
-      setText(byId("clock-date"), date(now));
-    }
-    byId("simulated").hidden = !simulated;
-    setText(byId("simulated"), `simulated clock ×${rate}`);
-    const silent = silentSeconds === null ? "" : span(silentSeconds);
-    byId("link").dataset.state = state;
-    setText(byId("link"), { connecting: "Connecting", live: "Live", stale: "Stale", reconnecting: "Reconnecting" }[state]);
-    const old = state === "stale" || state === "reconnecting";
-    byId("stale").hidden = !old;
-    document.body.classList.toggle("old", old);
-    if (old) setText(byId("stale"), `Stale since ${silent}: the service is not heard${state === "reconnecting" ? ", connecting again" : ""}.`);
-    const flying = flights.filter(({ position }) => position !== null && position.airborne !== false).length;
-    if (this.#moment) this.#showCounts(this.#moment.counts, this.#moment.flying);
-    else this.#showCounts(this.#picture.counts, flying);
+    const flying = this.#picture.flights.filter(({ position }) => position !== null && position.airborne !== false);
+    showLink(this.#picture);
+    if (this.#moment) showCounts(this.#moment.counts, this.#moment.flying);
+    else if (this.#picture.now !== null) showCounts(this.#picture.counts, flying.length);
     this.#timeline.refresh();
     this.#details.refresh();
   }
 
-  #showCounts(counts, flying) {
-    const list = byId("counts");
-    if (!list.firstElementChild) {
-      list.append(
-        ...["green", "yellow", "red"].map((status) => element("li", { id: `count-${status}`, title: `blocks: ${STATUS_WORDS[status]}` },
-          element("span", { class: "mark", "data-status": status, "aria-hidden": "true" }),
-          element("b"), element("span", { text: ` ${status}` }))),
-        element("li", { id: "count-flights", title: "aircraft in the air" }, element("b"), " flying"));
-    }
-    for (const status of ["green", "yellow", "red"]) setText(byId(`count-${status}`).querySelector("b"), String(counts[status]));
-    setText(byId("count-flights").querySelector("b"), String(flying));
-  }
-
-  /** Return the blocks shown, by key. */
+  /** Return the blocks in use at the time shown, by key. */
   #blocks() {
     return this.#moment?.blocks ?? this.#picture.blocks;
   }
 
   #showBlocks() {
-    const shown = this.#filters.shown([...this.#blocks().values()]);
     const isHeat = this.#filters.heatSpan !== null;
-    this.#city.showBlocks(isHeat ? [] : shown);
-    this.#traffic.showAlarms(isHeat ? [] : shown);
+    const shown = isHeat ? [] : this.#filters.shown([...this.#blocks().values()]);
+    this.#city.showBlocks(shown);
+    this.#traffic.showAlarms(shown);
   }
 
   async #showHeat() {
-    const seconds = this.#filters.heatSpan;
     this.#heatRequest?.abort();
-    if (seconds === null) {
+    const span = this.#filters.heatSpan;
+    const base = this.#timeline.moment ?? this.#picture.now;
+    if (span === null || base === null) {
       this.#city.showHeat([]);
       return;
     }
     this.#heatRequest = new AbortController();
-    const base = this.#timeline.moment ?? this.#picture.now ?? Date.now();
-    const [from, to] = [Math.min(base, base + seconds * 1000), Math.max(base, base + seconds * 1000)];
+    const [begin, end] = span < 0 ? [span, 0] : [0, span];
+    const [from, to] = [begin, end].map((seconds) => new Date(base + seconds * 1000).toISOString());
     try {
-      const { blocks } = await get("/v1/airspace/occupancy",
-        { from: new Date(from).toISOString(), to: new Date(to).toISOString() }, this.#heatRequest.signal);
+      const { blocks } = await get("/v1/airspace/occupancy", { from, to }, this.#heatRequest.signal);
       const columns = new Map();
-      for (const { block: [i, j, k], seconds: use } of blocks) {
-        if (this.#filters.showsLayer(k)) columns.set(`${i}/${j}`, [i, j, (columns.get(`${i}/${j}`)?.[2] ?? 0) + use]);
+      for (const { block: [i, j, k], seconds } of blocks) {
+        const [, , before] = columns.get(`${i}/${j}`) ?? [i, j, 0];
+        if (this.#filters.showsLayer(k)) columns.set(`${i}/${j}`, [i, j, before + seconds]);
       }
       setText(byId("heat-most"), `${Math.round(this.#city.showHeat([...columns.values()]))} s`);
     } catch (error) {
@@ -259,45 +244,49 @@ class Console {
     }
   }
 
-  // ---- another time
-
+  /** Show another moment; null is the present. */
   async #showMoment(moment) {
     this.#momentRequest?.abort();
     document.body.classList.toggle("elsewhen", moment !== null);
     if (moment === null) {
-      this.#moment = null;
-      this.#traffic.showPlanned(null);
-      this.#showBlocks();
-      this.#showHeat();
-      this.#refresh();
+      this.#takeMoment(null, null);
       return;
     }
     const { signal } = this.#momentRequest = new AbortController();
     try {
-      const { blocks, counts } = await blocksAt(moment, signal);
-      this.#moment = { counts, flying: 0, blocks: new Map(blocks.map((entry) => [keyOf(entry.block), entry])) };
-      this.#traffic.showPlanned([]);
-      this.#showBlocks();
-      this.#showHeat();
-      this.#refresh();
-      const aircraft = await aircraftAt(moment, signal);
-      this.#traffic.showPlanned(aircraft);
-      this.#moment.flying = aircraft.length;
-      this.#refresh();
+      const [{ blocks, counts }, aircraft] = await Promise.all([blocksAt(moment, signal), aircraftAt(moment, signal)]);
+      const byKey = new Map(blocks.map((entry) => [keyOf(entry.block), entry]));
+      this.#takeMoment({ counts, blocks: byKey, flying: aircraft.length }, aircraft);
     } catch (error) {
       if (!aborted(error)) this.#notice(`${clockTime(moment)} UTC: ${error.message}`);
     }
+  }
+
+  #takeMoment(moment, aircraft) {
+    this.#moment = moment;
+    this.#traffic.showPlanned(aircraft);
+    this.#showBlocks();
+    this.#showHeat();
+    this.#refresh();
+  }
+
+  #animate(at, drawn = 0) {
+    const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    const due = at - drawn >= (calm ? REFRESH_MS : FRAME_MS);
+    if (due && this.#picture.state === "live" && this.#moment === null) this.#traffic.draw();
+    requestAnimationFrame((next) => this.#animate(next, due ? at : drawn));
   }
 
   // ---- choosing
 
   #choose(selection) {
     this.#selection = selection;
-    this.#traffic.selected = selection?.id ?? null;
+    for (const each of [this.#traffic, this.#alerts, this.#flights]) each.selected = selection?.id ?? null;
     this.#traffic.showBlock(selection?.kind === "block" ? selection.block : null);
     this.#traffic.showPath([], []);
     this.#showDetails();
-    if (selection !== null) this.#openTab("details");
+    if (selection === null) this.#showLists();
+    else this.#openTab("details");
   }
 
   #showDetails() {
@@ -319,9 +308,9 @@ class Console {
   #showPicking(end) {
     byId("map").classList.toggle("picking", end !== null);
     byId("crosshair").hidden = end === null;
-    const hint = byId("picking");
-    hint.hidden = end === null;
-    if (end !== null) setText(hint, `Click the ${end} on the map, or press Enter to take the centre. Esc ends this.`);
+    byId("picking").hidden = end === null;
+    if (end === null) return;
+    setText(byId("picking"), `Click the ${end} on the map, or press Enter to take the centre. Esc ends this.`);
   }
 
   #listenToMap() {
@@ -332,7 +321,7 @@ class Console {
         return;
       }
       const flight = this.#traffic.at(point);
-      const block = flight ? null : this.#city.blockAtPoint(point) ?? this.#grid.blockAt(lngLat.lng, lngLat.lat, 0);
+      const block = this.#city.blockAtPoint(point) ?? this.#grid.blockAt(lngLat.lng, lngLat.lat, 0);
       if (flight) this.#choose({ kind: flight.track_id ? "track" : "flight", id: idOf(flight) });
       else this.#choose(block === null ? null : { kind: "block", block });
     });
@@ -343,17 +332,8 @@ class Console {
     });
   }
 
-  #animate(at, drawn = 0) {
-    const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    const due = at - drawn >= (calm ? REFRESH_MS : FRAME_MS);
-    if (due && this.#picture.state === "live" && this.#moment === null) this.#traffic.draw();
-    requestAnimationFrame((next) => this.#animate(next, due ? at : drawn));
-  }
-
-  // ---- keys
-
   #listenToKeys() {
-    const shortcuts = [
+    listenToKeys([
       ["1", "Alerts", () => this.#focusTab("alerts")],
       ["2", "Flights", () => this.#focusTab("flights")],
       ["3", "Details", () => this.#focusTab("details")],
@@ -369,45 +349,26 @@ class Console {
       ["F", "Whole airspace", () => this.#city.goHome()],
       ["M", "Move the focus to the map", () => this.#city.map.getCanvas().focus()],
       ["T", "Dark or light", toggleTheme],
-      ["?", "This list", () => byId("help-dialog").showModal()],
-    ];
-    const more = [["Esc", "Close what is open"], ["Enter", "While a place is chosen: take the map's centre"], ["↑ ↓", "Move within a list"]];
-    byId("help-list").append(...[...shortcuts, ...more].flatMap(([key, words]) =>
-      [element("dt", {}, element("kbd", { text: key })), element("dd", { text: words })]));
-    addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || byId("help-dialog").open) return;
-      if (event.key === "Escape") this.#escape();
-      if (event.target.matches("input:not([type=range]):not([type=checkbox]), select, textarea")) return;
-      if (event.key === "Enter" && this.#newFlight.picking !== null && !event.target.matches("button")) {
-        const { lng, lat } = this.#city.map.getCenter();
-        this.#newFlight.place(lng, lat);
-        event.preventDefault();
-      }
-      const shortcut = shortcuts.find(([key]) => key.toLowerCase() === event.key.toLowerCase());
-      if (shortcut) {
-        event.preventDefault();
-        shortcut[2]();
-      }
+    ], {
+      escape: () => (this.#newFlight.picking === null ? this.#choose(null) : this.#newFlight.pick(null)),
+      enter: () => this.#pickCentre(),
     });
+  }
+
+  #pickCentre() {
+    if (this.#newFlight.picking === null) return false;
+    const { lng, lat } = this.#city.map.getCenter();
+    this.#newFlight.place(lng, lat);
+    return true;
   }
 
   #focusTab(tab) {
     this.#openTab(tab);
     (byId(tab).querySelector("button, input") ?? byId(`tab-${tab}`)).focus();
   }
-
-  #escape() {
-    if (this.#newFlight.picking !== null) this.#newFlight.pick(null);
-    else this.#choose(null);
-  }
 }
 
-const ramp = document.querySelector(".ramp");
-ramp.style.background = `linear-gradient(to right, ${HEAT_RAMP.join(", ")})`;
-
 new Console().start().catch((error) => {
-  const words = globalThis.maplibregl ? error.message : "MapLibre did not load";
-  byId("stale").hidden = false;
-  setText(byId("stale"), `The console cannot start: ${words}. Reload the page to try again.`);
+  showFailure(globalThis.maplibregl ? error.message : "MapLibre did not load");
   throw error;
 });

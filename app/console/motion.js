@@ -34,7 +34,7 @@ export class Motion {
     this.#tracks = present;
   }
 
-  /** Return all aircraft as they are to be drawn: `{id, flight, lon, lat, alt_m, heading}`, heading in radians from north. */
+  /** Return all aircraft as they are to be drawn: `{id, flight, lon, lat, alt_m, heading}`, radians from north. */
   positions(at) {
     return [...this.#tracks].map(([id, track]) => ({
       id, flight: track.flight, heading: track.heading, ...between(track, this.#progress(track, at)),

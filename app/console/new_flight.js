@@ -114,8 +114,9 @@ export class NewFlight {
     const preview = intent.state === "preview";
     const now = this.#actions.now();
     const time = (text) => `${clockTime(Date.parse(text))} UTC, ${relative(Date.parse(text), now)}`;
+    const headline = preview ? "It can be flown so (preview, nothing reserved)" : `Accepted as #${intent.sequence}`;
     return element("div", { class: "outcome good" },
-      element("strong", { text: preview ? "It can be flown so (preview, nothing reserved)" : `Accepted as #${intent.sequence}` }),
+      element("strong", { text: headline }),
       facts([
         ["Departure", time(intent.departure)], ["Arrival", time(intent.arrival)],
         ["Flight time", span(intent.flight_time_s)], ["Delay", `${intent.delay_s.toFixed(1)} s`],

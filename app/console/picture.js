@@ -6,8 +6,8 @@ import { keyOf } from "/console/grid.js";
 const STALE_MS = 3_500;
 
 /**
- * Tells of changes by events: `tick`, `blocks`, `flights`, `alerts`, `link` (the connection), `intent` and `conformance`
- * (detail: the journal's entry). Takes the time of `performance.now()` from outside, so that tests can choose it.
+ * Tells of changes by events: `tick`, `blocks`, `flights`, `alerts`, `link` (the connection), `intent` and
+ * `conformance` (detail: the journal's entry). Takes the time from outside, so that tests can choose it.
  */
 export class Picture extends EventTarget {
   /** Blocks in use by key. */

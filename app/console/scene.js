@@ -101,32 +101,25 @@ export class Scene {
   #gl;
   #map;
   #colours;
-  #atlasIsOld = true;
+  #compose;
+  #still = new Float32Array(0);
   #batches;
   #texture;
+  #atlasIsOld;
 
-  /** `compose` is called for every frame and returns `{sprites, segments}`, made by `spriteArray` and `segmentArray`. */
+  /** `compose` is called for every frame; it returns `{sprites, segments}` of `spriteArray` and `segmentArray`. */
   constructor(map, frame, colours, compose) {
     this.#map = map;
     this.#colours = colours;
-    this.compose = compose;
+    this.#compose = compose;
     const canvas = document.createElement("canvas");
     canvas.className = "scene";
     map.getCanvasContainer().append(canvas);
-    const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
-    this.#gl = gl;
-    const corners = buffer(gl, CORNERS, gl.STATIC_DRAW);
-    const lines = [["a_from", 3], ["a_to", 3], ["a_colour", 4], ["a_width", 1], ["a_dash", 1]];
-    this.#batches = {
-      still: batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, lines),
-      moving: batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, lines),
-      sprites: batch(gl, corners, SPRITE_VERTEX, SPRITE_FRAGMENT, [
-        ["a_position", 3], ["a_heading", 1], ["a_cell", 1], ["a_scale", 1],
-      ]),
-    };
-    this.#texture = gl.createTexture();
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    this.#gl = canvas.getContext("webgl2", { antialias: false, depth: false });
+    this.#prepare();
+    // A display that sleeps, or a driver that starts anew, takes away all that was handed over.
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => this.#prepare());
     map.addLayer({
       id: "camera", type: "custom", renderingMode: "3d",
       render: (_, { defaultProjectionData }) => {
@@ -138,7 +131,8 @@ export class Scene {
 
   /** Take lines that stay as they are for a while. */
   setStill(segments) {
-    fill(this.#gl, this.#batches.still, segmentArray(segments));
+    this.#still = segmentArray(segments);
+    fill(this.#gl, this.#batches.still, this.#still);
   }
 
   /** Draw in other colours from now on. */
@@ -149,13 +143,13 @@ export class Scene {
 
   /** Draw a frame, as the map's camera stands. */
   draw() {
-    if (this.matrix === null) return;
     const gl = this.#gl;
+    if (this.matrix === null || gl.isContextLost()) return;
     const { width, height, clientWidth, clientHeight } = this.#map.getCanvas();
     if (gl.canvas.width !== width || gl.canvas.height !== height) Object.assign(gl.canvas, { width, height });
     gl.viewport(0, 0, width, height);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    const { sprites, segments } = this.compose(this.matrix);
+    const { sprites, segments } = this.#compose(this.matrix);
     const { still, moving, sprites: aircraft } = this.#batches;
     const matrix = new Float32Array(this.matrix);
     const halfScreen = [clientWidth / 2, clientHeight / 2];
@@ -176,6 +170,24 @@ export class Scene {
     gl.uniform1f(aircraft.uniform("u_cells"), SYMBOLS.length);
     fill(gl, aircraft, sprites);
     drawBatch(gl, aircraft);
+  }
+
+  #prepare() {
+    const gl = this.#gl;
+    const corners = buffer(gl, CORNERS, gl.STATIC_DRAW);
+    const lines = [["a_from", 3], ["a_to", 3], ["a_colour", 4], ["a_width", 1], ["a_dash", 1]];
+    this.#batches = {
+      still: batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, lines),
+      moving: batch(gl, corners, SEGMENT_VERTEX, SEGMENT_FRAGMENT, lines),
+      sprites: batch(gl, corners, SPRITE_VERTEX, SPRITE_FRAGMENT, [
+        ["a_position", 3], ["a_heading", 1], ["a_cell", 1], ["a_scale", 1],
+      ]),
+    };
+    this.#texture = gl.createTexture();
+    this.#atlasIsOld = true;
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    fill(gl, this.#batches.still, this.#still);
   }
 
   #drawAtlas(gl) {

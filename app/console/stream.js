@@ -13,7 +13,7 @@ export function waitMs(failures, random = Math.random()) {
   return longest * (0.5 + random / 2);
 }
 
-/** Read the stream until the page closes. `onOpen` and `onLost` say when it begins and ends, `onEvent` gets each event. */
+/** Read the stream until the page closes; `onOpen` and `onLost` are told when it begins and ends. */
 export async function follow({ onOpen, onEvent, onLost }) {
   const memory = { lastId: null };
   let failures = 0;

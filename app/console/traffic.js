@@ -1,20 +1,18 @@
 /** Everything in the air: aircraft with stems to the ground and vectors ahead, paths, outlines, and name tags. */
 
-import { element, setText } from "/console/dom.js";
 import { toScreen } from "/console/frame.js";
 import { idOf } from "/console/flights.js";
 import { Motion } from "/console/motion.js";
 import { rgba } from "/console/palette.js";
 import { Scene, segmentArray, spriteArray } from "/console/scene.js";
 import { symbolOf } from "/console/symbols.js";
-import { flightName, flightReason } from "/console/words.js";
+import { Tags, isAlarming } from "/console/tags.js";
 
 /** How far ahead a vector shows where an aircraft will be, as on a radar screen. */
 const VECTOR_S = 10;
 const REACH_PX = 16;
-const MOST_TAGS = 24;
-const TAG_PX = { width: 210, height: 38 };
-const RANK = { violating: 0, deviating: 1, lost: 2, unseen: 3 };
+/** Symbols of aircraft whose velocity says where they go. */
+const MOVING = ["conforming", "deviating", "violating"];
 
 export class Traffic {
   /** The flight or track that is selected, and the one under the pointer: ids or null. */
@@ -41,7 +39,7 @@ export class Traffic {
     this.#frame = frame;
     this.#grid = grid;
     this.#colours = colours;
-    this.#tags = tags;
+    this.#tags = new Tags(tags);
     this.#scene = new Scene(map, frame, colours, (matrix) => this.#compose(matrix));
   }
 
@@ -50,7 +48,7 @@ export class Traffic {
     this.#motion.take(flights, performance.now(), rate);
   }
 
-  /** Show aircraft of another moment, `{flight, lon, lat, alt_m, heading}`, instead of the present ones; null ends that. */
+  /** Show aircraft of another moment, `{flight, lon, lat, alt_m, heading}`, not the present ones; null ends that. */
   showPlanned(aircraft) {
     this.#planned = aircraft;
     this.draw();
@@ -95,69 +93,42 @@ export class Traffic {
   /** Return the flight or track drawn nearest to a point of the canvas, null where none is. */
   at({ x, y }) {
     const near = this.#drawn
-      .map(({ flight, screen }) => ({ flight, px: screen === null ? Infinity : Math.hypot(screen[0] - x, screen[1] - y) }))
+      .filter(({ screen }) => screen !== null)
+      .map(({ flight, screen }) => ({ flight, px: Math.hypot(screen[0] - x, screen[1] - y) }))
       .filter(({ px }) => px < REACH_PX)
       .sort((one, other) => one.px - other.px);
     return near[0]?.flight ?? null;
   }
 
-  /** Return where an aircraft is drawn on the canvas, null where it is not. */
-  screenOf(id) {
-    return this.#drawn.find(({ flight }) => idOf(flight) === id)?.screen ?? null;
-  }
-
   #compose(matrix) {
     const aircraft = this.#planned ?? this.#motion.positions(performance.now());
     const { clientWidth: width, clientHeight: height } = this.#map.getCanvas();
-    const sprites = [];
-    const segments = [];
     this.#drawn = aircraft.map(({ flight, heading, ...position }) => {
       const at = this.#frame.local(position);
       const symbol = this.#planned ? "planned" : symbolOf(flight);
-      const marked = idOf(flight) === this.selected || idOf(flight) === this.hovered;
-      const alarmed = symbol in RANK;
-      sprites.push({ at, heading, symbol, scale: (marked ? 1.35 : 1) * (symbol === "violating" ? 1.2 : 1), alarmed });
-      const colour = alarmed ? this.#colours[symbol === "violating" ? "red" : "yellow"] : this.#colours.aircraft;
-      segments.push({ from: [at[0], at[1], 0], to: at, colour: rgba(colour, marked || alarmed ? 0.7 : 0.28), width: 1 });
-      const velocity = flight.velocity_mps;
-      if (velocity && symbol !== "grounded" && symbol !== "planned" && symbol !== "lost") {
-        const ahead = [at[0] + velocity.east * VECTOR_S, at[1] + velocity.north * VECTOR_S, at[2] + velocity.up * VECTOR_S];
-        segments.push({ from: at, to: ahead, colour: rgba(colour, marked || alarmed ? 0.9 : 0.35), width: alarmed ? 2 : 1.2 });
-      }
-      return { flight, at, symbol, screen: toScreen(matrix, at, width, height) };
+      const marked = [this.selected, this.hovered].includes(idOf(flight));
+      return { flight, heading, at, symbol, marked, screen: toScreen(matrix, at, width, height) };
     });
-    sprites.sort((one, other) => one.alarmed - other.alarmed);
-    this.#placeTags(width, height);
-    return { sprites: spriteArray(sprites), segments: segmentArray(segments) };
+    // Those that want attention are drawn over the others.
+    this.#drawn.sort((one, other) => isAlarming(one.symbol) - isAlarming(other.symbol));
+    this.#tags.show(this.#drawn, width, height);
+    return {
+      sprites: spriteArray(this.#drawn.map((drawn) => ({ ...drawn, scale: scaleOf(drawn) }))),
+      segments: segmentArray(this.#drawn.flatMap((drawn) => this.#linesOf(drawn))),
+    };
   }
 
-  /** Write names beside the aircraft that want attention, where there is room. */
-  #placeTags(width, height) {
-    const wanted = this.#drawn
-      .filter(({ flight, symbol, screen }) => screen !== null && screen[0] > 0 && screen[1] > 0 && screen[0] < width && screen[1] < height
-        && (symbol in RANK || [this.selected, this.hovered].includes(idOf(flight))))
-      .sort((one, other) => this.#rank(one) - this.#rank(other));
-    const taken = [];
-    let used = 0;
-    for (const { flight, symbol, screen } of wanted) {
-      const right = Math.round(screen[0]) + 16;
-      const [x, y] = [right + TAG_PX.width < width ? right : right - 32 - TAG_PX.width, Math.round(screen[1]) - 34];
-      const covered = taken.some(([left, top]) => Math.abs(left - x) < TAG_PX.width && Math.abs(top - y) < TAG_PX.height);
-      if (covered || used === MOST_TAGS) continue;
-      taken.push([x, y]);
-      const tag = this.#tags.children[used] ?? this.#tags.appendChild(element("div", { class: "tag" }, element("b"), element("span")));
-      used += 1;
-      tag.hidden = false;
-      tag.dataset.symbol = symbol;
-      tag.style.transform = `translate(${x}px, ${y}px)`;
-      setText(tag.firstChild, flightName(flight));
-      setText(tag.lastChild, tagWords(flight));
-    }
-    for (const spare of [...this.#tags.children].slice(used)) spare.hidden = true;
-  }
-
-  #rank({ flight, symbol }) {
-    return [this.hovered, this.selected].includes(idOf(flight)) ? -1 : RANK[symbol];
+  /** Return an aircraft's pole to the ground, and its vector where it moves. */
+  #linesOf({ flight, at, symbol, marked }) {
+    const { aircraft, red, yellow } = this.#colours;
+    const plain = isAlarming(symbol) ? yellow : aircraft;
+    const colour = symbol === "violating" ? red : plain;
+    const strong = marked || isAlarming(symbol);
+    const pole = this.#pole(at, { colour: rgba(colour, strong ? 0.7 : 0.28), width: 1 });
+    const velocity = flight.velocity_mps;
+    if (velocity === null || !MOVING.includes(symbol)) return [pole];
+    const ahead = [velocity.east, velocity.north, velocity.up].map((speed, axis) => at[axis] + speed * VECTOR_S);
+    return [pole, { from: at, to: ahead, colour: rgba(colour, strong ? 0.9 : 0.35), width: strong ? 2 : 1.2 }];
   }
 
   #drawStill() {
@@ -210,8 +181,6 @@ export class Traffic {
   }
 }
 
-function tagWords(flight) {
-  const { position, velocity_mps: velocity, reasons } = flight;
-  const speed = velocity ? `${Math.hypot(velocity.east, velocity.north).toFixed(0)} m/s` : null;
-  return [position && `${Math.round(position.alt_m)} m`, speed, reasons.map(flightReason).join(", ")].filter(Boolean).join(" · ");
+function scaleOf({ symbol, marked }) {
+  return (marked ? 1.35 : 1) * (symbol === "violating" ? 1.2 : 1);
 }

@@ -18,9 +18,6 @@ export const CONFORMANCE_WORDS = {
   scheduled: "not departed yet",
 };
 
-/** What the service calls unseen although it need not be seen yet. */
-const SCHEDULED = "scheduled";
-
 const BLOCK_REASONS = {
   unplanned_use: "an aircraft is here, where nothing is reserved",
   off_track: "the flight that reserved it is off its track",
@@ -85,7 +82,9 @@ export const flightReason = (slug) => FLIGHT_REASONS[slug] ?? slug.replaceAll("_
 /** Return a refusal or another failed request as `{headline, explanation, detail}`. */
 export function explained(failure) {
   const problem = failure.problem;
-  if (problem === null) return { headline: "No answer", explanation: `Nothing is known: ${failure.message}.`, detail: "" };
+  if (problem === null) {
+    return { headline: "No answer", explanation: `Nothing is known: ${failure.message}.`, detail: "" };
+  }
   const slug = String(problem.type).split("/").pop();
   const explanation = REFUSALS[problem.reason] ?? PROBLEMS[slug] ?? problem.detail;
   return {
@@ -95,9 +94,9 @@ export function explained(failure) {
   };
 }
 
-/** Return how a flight keeps to its plan, for lists and symbols: its conformance, or `scheduled` before its departure. */
+/** Return how a flight keeps to its plan: its conformance, or `scheduled` where it need not be seen yet. */
 export function standing({ conformance, reasons }) {
-  return conformance === "unseen" && reasons.length === 0 ? SCHEDULED : conformance;
+  return conformance === "unseen" && reasons.length === 0 ? "scheduled" : conformance;
 }
 
 /** Return what a flight or track is called. */

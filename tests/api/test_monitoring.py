@@ -117,6 +117,7 @@ def test_a_flight_in_the_air_without_activation_is_nonconforming(lanes: Client, 
     assert flights(lanes)[flight]["reasons"] == ["not_activated"]
 
 
+@on_sqlite
 def test_a_flight_that_keeps_to_its_plan_stays_activated_and_makes_no_event(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     for now in range(DEPARTURE_MS, ARRIVAL_MS, 1000):
@@ -170,6 +171,7 @@ def test_a_lost_flight_is_contingent_after_half_a_minute(lanes: Client, clock: F
     assert flights(lanes)[flight]["conformance"] == "lost"
 
 
+@on_sqlite
 def test_a_flight_that_violates_for_half_a_minute_is_contingent(lanes: Client, clock: FakeClock) -> None:
     # Somebody hovers in the lane between while a flight that has left its own hovers there too.
     flight = activated(lanes)
@@ -185,6 +187,7 @@ def test_a_flight_that_violates_for_half_a_minute_is_contingent(lanes: Client, c
     assert states[6:] == [("contingent", "violating")] * 2
 
 
+@on_sqlite
 def test_a_flight_that_only_deviates_is_never_contingent(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS
@@ -195,6 +198,7 @@ def test_a_flight_that_only_deviates_is_never_contingent(lanes: Client, clock: F
     assert state_of(lanes, flight) == "nonconforming"
 
 
+@on_sqlite
 def test_who_is_met_on_its_own_reservation_is_violating_but_not_to_blame(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS
@@ -322,6 +326,7 @@ def test_what_a_look_cannot_record_the_next_one_records_once(lanes: Client, cloc
 # Status
 
 
+@on_sqlite
 def test_a_flight_on_its_reservations_is_green(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS
@@ -329,6 +334,7 @@ def test_a_flight_on_its_reservations_is_green(lanes: Client, clock: FakeClock) 
     assert colours(lanes) == {(0, 2, 0): ("green", []), (1, 2, 0): ("green", [])}
 
 
+@on_sqlite
 def test_a_flight_beside_its_reservations_is_yellow_there_and_here(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS
@@ -408,6 +414,7 @@ def mixed(lanes: Client, clock: FakeClock) -> Client:
     return lanes
 
 
+@on_sqlite
 @pytest.mark.parametrize(
     ("parameters", "blocks"),
     [
@@ -426,6 +433,7 @@ def test_filters_leave_out_and_do_not_count_the_rest(
     assert sum(mixed.get(STATUS, params=parameters).json()["counts"].values()) == len(blocks)
 
 
+@on_sqlite
 def test_status_as_geojson_has_the_colours_too(mixed: Client) -> None:
     answer = mixed.get(STATUS, params={"f": "geojson", "status": "red"}).json()
     assert answer["counts"] == {"green": 0, "yellow": 0, "red": 1}
@@ -438,6 +446,7 @@ def test_status_as_geojson_has_the_colours_too(mixed: Client) -> None:
     }
 
 
+@on_sqlite
 def test_a_block_has_the_colour_and_the_reasons_that_status_says(mixed: Client) -> None:
     answer = mixed.get("/v1/airspace/blocks/1/0/0").json()
     assert (answer["status"], answer["reasons"]) == ("red", ["reserved_by_another"])
@@ -554,6 +563,7 @@ def test_a_flight_says_everything_about_itself(lanes: Client, clock: FakeClock) 
     }  # fmt: skip
 
 
+@on_sqlite
 def test_a_track_says_what_is_known_of_it(lanes: Client, clock: FakeClock) -> None:
     see(lanes, "radar-1", 3.5, 1.5)
     clock.advance(seconds=1)
@@ -604,6 +614,7 @@ def test_who_flies_cannot_be_said_without_the_ledger(lanes: Client, path: str) -
 # Alerts
 
 
+@on_sqlite
 def test_without_deviations_there_are_no_alerts(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS
@@ -651,6 +662,7 @@ def test_an_aircraft_that_reaches_nobody_in_time_is_yellow(
     assert (alert["severity"], len(alert["threatens"])) == (severity, threats)
 
 
+@on_sqlite
 def test_the_newest_alert_comes_first_and_keeps_its_time(lanes: Client, clock: FakeClock) -> None:
     for n in range(3):
         for track in range(n + 1):
@@ -664,6 +676,7 @@ def test_the_newest_alert_comes_first_and_keeps_its_time(lanes: Client, clock: F
     ]
 
 
+@on_sqlite
 def test_an_alert_goes_with_its_cause(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS

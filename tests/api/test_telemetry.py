@@ -110,6 +110,7 @@ def test_whether_an_aircraft_flies_is_kept_as_it_was_said(client: Client, airbor
     assert tracks(client)["radar-1"]["position"]["airborne"] is airborne
 
 
+@on_sqlite
 def test_an_empty_report_is_taken(client: Client) -> None:
     assert send(client) == {**TAKEN, "accepted": 0}
 
@@ -131,6 +132,7 @@ def test_an_aircraft_may_be_some_kilometres_away(client: Client, elsewhere: dict
     assert tracks(client)["radar-1"]["position"]["block"] is None
 
 
+@on_sqlite
 @pytest.mark.parametrize("state", ["rejected", "cancelled", "ended"])
 def test_an_aircraft_that_flies_without_an_accepted_plan_is_still_seen(client: Client, state: str) -> None:
     flight = flown(client)
@@ -167,11 +169,13 @@ def test_a_refused_position_is_named_explained_and_harms_no_other(client: Client
     assert set(tracks(client)) == {"radar-1", "radar-2"}
 
 
+@on_sqlite
 def test_a_position_of_the_future_is_refused(client: Client) -> None:
     detail = refusal(client, seen(START_MS + 2001), "position-in-the-future")
     assert detail == "taken at 2026-11-22T08:00:02.001Z, but it is 2026-11-22T08:00:00.000Z"
 
 
+@on_sqlite
 def test_a_position_that_would_not_be_kept_is_refused(client: Client) -> None:
     detail = refusal(client, seen(START_MS - HOUR_MS - 1), "position-too-old")
     assert detail == "taken at 2026-11-22T06:59:59.999Z; positions are kept for 1 h"
@@ -311,6 +315,7 @@ def test_a_repeated_report_changes_nothing(client: Client, settings: Settings) -
 # Velocity, and what no aircraft does
 
 
+@on_sqlite
 def test_two_positions_make_a_velocity(client: Client) -> None:
     send(client, seen(START_MS - 1000, OLD_TOWN.point(1, 3)))
     assert tracks(client)["radar-1"]["velocity_mps"] is None
@@ -344,6 +349,7 @@ def test_a_jump_that_no_aircraft_makes_is_taken_and_flagged(client: Client) -> N
     assert (item["position"]["block"], item["position"]["flagged"], item["velocity_mps"]) == ([7, 4, 0], True, None)
 
 
+@on_sqlite
 def test_after_a_jump_an_aircraft_goes_on_from_there(client: Client) -> None:
     send(client, seen(START_MS - 2000), seen(START_MS - 1000, "B"))
     assert send(client, seen(START_MS, "B")) == TAKEN
@@ -478,6 +484,7 @@ def test_a_service_whose_writer_has_stopped_takes_no_positions(client: Client) -
     problem(client.post(TELEMETRY, json=report(seen())), 503, "ledger-unavailable")
 
 
+@on_sqlite
 def test_a_server_that_only_reads_takes_no_positions(client: Client, settings: Settings, clock: FakeClock) -> None:
     del client
     with served(create_app(settings_with(settings, read_only=True), clock)) as reader:

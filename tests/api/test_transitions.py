@@ -167,6 +167,7 @@ def test_activation_is_a_new_version_and_an_event(street: Client) -> None:
     assert kinds(street) == ["accepted", "activated"]
 
 
+@on_sqlite
 @pytest.mark.parametrize("action", ["activate", "end", "cancel"])
 def test_what_is_done_twice_is_done_once(street: Client, action: str) -> None:
     flight = accepted(street, FakeClock())
@@ -272,6 +273,7 @@ def test_once_it_has_landed_a_flight_gives_up_what_lies_ahead(
     assert_no_overlaps(on_street.ledger)
 
 
+@on_sqlite
 def test_what_was_freed_can_be_had_in_the_process_that_freed_it(street: Client, clock: FakeClock) -> None:
     flight = submit(street)
     clock.now_ms = MIDWAY_MS
@@ -293,6 +295,7 @@ def test_a_process_that_starts_later_knows_what_was_freed(
     assert_no_overlaps(on_street.ledger)
 
 
+@on_sqlite
 @pytest.mark.parametrize("last", ["on the ground before its departure", "in the air again"])
 def test_who_has_not_landed_since_its_departure_keeps_what_it_holds(
     street: Client, clock: FakeClock, last: str
@@ -307,6 +310,7 @@ def test_who_has_not_landed_since_its_departure_keeps_what_it_holds(
     assert attempt(street, flight["id"], "end").json()["reservations"] == flight["reservations"]
 
 
+@on_sqlite
 def test_a_flight_that_still_stands_on_its_pad_when_it_should_fly_gives_up_what_lies_ahead(
     street: Client, clock: FakeClock
 ) -> None:
@@ -317,6 +321,7 @@ def test_a_flight_that_still_stands_on_its_pad_when_it_should_fly_gives_up_what_
     assert against(street, clock)["delay_s"] == 0.0
 
 
+@on_sqlite
 def test_after_its_arrival_ending_a_flight_takes_nothing_away(street: Client, clock: FakeClock) -> None:
     flight = submit(street)
     clock.now_ms = ARRIVAL_MS + 1

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PIL import Image
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, FloatRect, Page
+    from playwright.sync_api import Browser, Page
 
 _FLAGS = (
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
@@ -74,16 +74,11 @@ class Watched:
 
     def pixels(self) -> npt.NDArray[np.int64]:
         """Return what the map shows right of its cards, rows of red, green and blue."""
-        box = self.page.locator("#map").bounding_box()
-        assert box is not None
-        clip: FloatRect = {
-            "x": box["x"] + 230, "y": box["y"] + 10, "width": box["width"] - 300, "height": box["height"] - 60,
-        }  # fmt: skip
         # Name tags are coloured too.
         self.run("() => document.getElementById('tags').style.visibility = 'hidden'")
-        image = self.page.screenshot(clip=clip)
+        picture = np.asarray(Image.open(BytesIO(self.page.locator("#map").screenshot())).convert("RGB"))
         self.run("() => document.getElementById('tags').style.visibility = ''")
-        return np.asarray(Image.open(BytesIO(image)).convert("RGB")).astype(np.int64)
+        return picture[10:-60, 230:-70].astype(np.int64)
 
     def _note(self, kind: str, text: str) -> None:
         if kind in ("error", "warning"):

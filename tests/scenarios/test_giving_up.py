@@ -23,9 +23,7 @@ LINK_MS = 1668
 
 
 # The checker is not yet told that a flight holds its way only until it landed.
-cut = pytest.mark.xfail(
-    raises=typer.Exit, strict=True, reason="verify judges the whole way of a flight that landed early"
-)
+cut = pytest.mark.xfail(raises=typer.Exit, strict=True, reason="verify judges the way beyond a landing too")
 
 
 @pytest.fixture
