@@ -45,12 +45,24 @@ def verify(
 
 
 def checked(intent: FlightIntent) -> CheckedFlight:
-    """Return an intent as the checker sees it: with what it must hold, which is nothing if it was released wholly."""
-    released = intent.state in (State.CANCELLED, State.ENDED) and len(intent.reservations) == 0
-    return _flight(intent.id, intent.reservations, None if released else intent.trajectory)
+    """Return an intent as the checker sees it: with what it must hold.
+
+    Who gave up all of it must hold nothing; who gave up what lay ahead must hold what lies behind.
+    """
+    held, trajectory = intent.reservations, intent.trajectory
+    if trajectory is None or intent.state not in (State.CANCELLED, State.ENDED):
+        return _flight(intent.id, held, trajectory)
+    if len(held) == 0:
+        return _flight(intent.id, held, None)
+    # A reservation's exit lies one millisecond behind what it covers.
+    until_ms = int(held.exit_ms.max()) - 1
+    span = (trajectory.departure_ms, until_ms) if until_ms < trajectory.arrival_ms else None
+    return _flight(intent.id, held, trajectory, span)
 
 
-def _flight(name: str, held: Reservations, trajectory: Trajectory | None) -> CheckedFlight:
+def _flight(
+    name: str, held: Reservations, trajectory: Trajectory | None, span: tuple[int, int] | None = None
+) -> CheckedFlight:
     none = np.empty(0, dtype=np.int64)
     return CheckedFlight(
         name,
@@ -60,6 +72,7 @@ def _flight(name: str, held: Reservations, trajectory: Trajectory | None) -> Che
         held.block,
         held.enter_ms,
         held.exit_ms,
+        span,
     )
 
 

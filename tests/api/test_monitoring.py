@@ -584,6 +584,23 @@ def test_a_track_says_what_is_known_of_it(lanes: Client, clock: FakeClock) -> No
     assert item["velocity_mps"] == pytest.approx({"east": 10.0, "north": 0.0, "up": 0.0}, abs=0.5)
 
 
+def test_since_when_is_known_once_somebody_has_looked(lanes: Client, clock: FakeClock) -> None:
+    found = []
+    see(lanes, "radar-1", 3.5, 1.5)
+    for pass_ms in (0, FRESHNESS_MS + 1):
+        clock.advance(ms=pass_ms)
+        for _ in range(2):
+            item = flights(lanes)["radar-1"]
+            found.append((item["conformance"], item["since"]))
+            look(lanes)
+    assert found == [
+        ("deviating", None),
+        ("deviating", "2026-11-22T08:00:00.000Z"),
+        ("lost", None),
+        ("lost", "2026-11-22T08:00:05.001Z"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("before_ms", "listed"), [(60_001, False), (60_000, False), (59_999, True), (0, True), (-11_000, True)]
 )
@@ -753,8 +770,9 @@ def test_two_monitors_that_look_at_once_record_each_change_once(
         assert [kind for kind, whose, _ in told(lanes) if whose == unseen] == ["accepted", "ended"]
 
 
-def test_a_change_that_somebody_else_made_meanwhile_is_not_undone(
-    lanes: Client, on_lanes: Settings, clock: FakeClock
+@pytest.mark.parametrize(("action", "state"), [("activate", "activated"), ("end", "ended")])
+def test_a_change_that_an_operator_made_meanwhile_is_not_undone(
+    lanes: Client, on_lanes: Settings, clock: FakeClock, action: str, state: str
 ) -> None:
     flight = submit(lanes)
     clock.now_ms = DEPARTURE_MS
@@ -763,8 +781,8 @@ def test_a_change_that_somebody_else_made_meanwhile_is_not_undone(
     all_at_once(
         on_lanes.ledger,
         [lanes.service.writer],
-        lambda: answers.append(lanes.post(f"{SUBMIT}/{flight}/end").status_code),
+        lambda: answers.append(lanes.post(f"{SUBMIT}/{flight}/{action}").status_code),
         partial(look, lanes),
     )
     assert answers == [200]
-    assert state_of(lanes, flight) == "ended"
+    assert state_of(lanes, flight) == state

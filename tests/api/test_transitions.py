@@ -49,7 +49,7 @@ def submit(client: Client, origin: str = "W", destination: str = "E", **members:
     return answer
 
 
-def see(client: Client, flight: str, time_ms: int, place: Any = (0, 0, 0), *, airborne: bool = True) -> None:
+def see(client: Client, flight: str, time_ms: int, place: Any = (0, 0, 0), *, airborne: bool | None = True) -> None:
     """Report where a flight's aircraft was."""
     where = position(place, time_ms, district=STREET, flight_intent_id=flight, airborne=airborne)
     assert client.post(TELEMETRY, json=report(where)).json()["accepted"] == 1
@@ -296,7 +296,7 @@ def test_a_process_that_starts_later_knows_what_was_freed(
 
 
 @on_sqlite
-@pytest.mark.parametrize("last", ["on the ground before its departure", "in the air again"])
+@pytest.mark.parametrize("last", ["on the ground before its departure", "in the air again", "somewhere"])
 def test_who_has_not_landed_since_its_departure_keeps_what_it_holds(
     street: Client, clock: FakeClock, last: str
 ) -> None:
@@ -307,6 +307,8 @@ def test_who_has_not_landed_since_its_departure_keeps_what_it_holds(
     if last == "in the air again":
         see(street, flight["id"], MIDWAY_MS - 1000, (2, 0, 0), airborne=False)
         see(street, flight["id"], MIDWAY_MS, (2, 0, 0), airborne=True)
+    elif last == "somewhere":
+        see(street, flight["id"], MIDWAY_MS, (2, 0, 0), airborne=None)
     assert attempt(street, flight["id"], "end").json()["reservations"] == flight["reservations"]
 
 

@@ -37,6 +37,8 @@ def test_what_operators_write_is_text(console: Watched, served: Quarter) -> None
     assert row.locator("strong").inner_text() == wicked
     row.click()
     console.page.get_by_role("heading", name=wicked).wait_for()
+    console.page.locator("#details tbody button").first.click()
+    console.page.locator("#details td button", has_text=wicked).first.wait_for()
     assert console.page.locator("main img, aside img").count() == 0
 
 

@@ -12,7 +12,7 @@ from tests.console.quarter import GRID, Quarter, place
 def test_events_are_read_however_the_stream_is_cut(modules: Watched, size: int) -> None:
     text = (
         ": hello\n\nevent: status\ndata: {\"a\":\ndata: 1}\n\nid: 7\nevent: intent\ndata: x\r\n\r\n"
-        "data:bare\rid: 8\r\rid: 9\ndata\n\nevent: unfinished\ndata: never\n"
+        "data:bare\rid: 8\r\rid: 9\ndata\n\ndata: one\r\ndata: two\r\n\r\nevent: unfinished\ndata: never\n"
     )  # fmt: skip
     parts = [text[start : start + size] for start in range(0, len(text), size)]
     read = modules.run(
@@ -30,6 +30,7 @@ def test_events_are_read_however_the_stream_is_cut(modules: Watched, size: int) 
             {"event": "intent", "data": "x"},
             {"event": "message", "data": "bare"},
             {"event": "message", "data": ""},
+            {"event": "message", "data": "one\ntwo"},
         ],
         "lastId": "9",
     }

@@ -69,9 +69,9 @@ def draw(browser: "Browser", url: str, theme: Theme, *, close: bool) -> None:
 
 
 def settle(console: Watched) -> None:
-    """Go to a violation that lasts until the camera is there."""
+    """Go to a flight off its track whose violation lasts until the camera is there."""
     page = console.page
-    violation = page.locator('#alerts-list button[data-status="red"]', has_text="violating").filter(has_text="reaches")
+    violation = page.locator('#alerts-list button[data-status="red"]', has_text="violating · off its track")
     for _ in range(_ATTEMPTS):
         page.click("#tab-alerts")
         violation.first.wait_for(timeout=_TRAFFIC_MS)
