@@ -45,13 +45,17 @@ class View:
 
 @dataclass(frozen=True)
 class Change:
-    """What is to be recorded of one aircraft: what was remarked of it and what is now, and where its state goes."""
+    """What is to be recorded of one aircraft: what was remarked of it and what is now, and where its state goes.
+
+    Where it `is_over`, the flight has ended or the track is gone: nothing is remarked, rather than that it conforms.
+    """
 
     aircraft: Aircraft
     flight: Flight | None
     before: Remark | None
     after: Remark | None
     state: State | None
+    is_over: bool = False
 
 
 class Monitor:
@@ -166,7 +170,7 @@ class Monitor:
         remarks, now = view.picture.remarks, view.at_ms
         changes = [
             # Ended, or gone.
-            Change(aircraft, None, before, None, None)
+            Change(aircraft, None, before, None, None, is_over=True)
             for aircraft, before in remarks.items()
             if aircraft not in view.assessed
         ]
@@ -176,10 +180,11 @@ class Monitor:
             is_severe = after is not None and after.conformance in (Conformance.LOST, Conformance.VIOLATING)
             since_ms = after.since_ms if after is not None and is_severe else None
             state = move(assessment, since_ms, now, self._thresholds)
-            if state is State.ENDED:
+            is_over = state is State.ENDED
+            if is_over:
                 after = None
             if state is not None or after != before:
-                changes.append(Change(aircraft, assessment.flight, before, after, state))
+                changes.append(Change(aircraft, assessment.flight, before, after, state, is_over))
         return changes
 
     def _end_unseen(self, writer: Writer, now: int) -> None:
@@ -220,7 +225,7 @@ def _record(deconfliction: Deconfliction, changes: Sequence[Change], transaction
         with suppress(IllegalTransition):
             deconfliction.move(transaction, now, intent, change.state)
             moved.append((intent.sequence, intent.id, change.state))
-    remarked = {change.aircraft: change.after for change in current if change.after != change.before}
-    if remarked:
-        transaction.remark(remarked, now)
+    changed = [change for change in current if change.after != change.before]
+    transaction.forget_remarks(change.aircraft for change in changed if change.is_over)
+    transaction.remark({change.aircraft: change.after for change in changed if not change.is_over}, now)
     return Moved(moved)

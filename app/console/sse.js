@@ -11,7 +11,7 @@ export class EventParser {
   feed(text) {
     const all = this.#rest + text;
     // A lone carriage return at the end may be half of a line's end.
-    const usable = all.length;
+    const usable = all.endsWith("\r") ? all.length - 1 : all.length;
     const lines = all.slice(0, usable).split(/\r\n|\n|\r/);
     this.#rest = lines.pop() + all.slice(usable);
     const events = [];

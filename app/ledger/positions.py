@@ -89,6 +89,8 @@ def remove_of(connection: Connection, sequences: Sequence[int]) -> None:
 
 def remark(connection: Connection, changed: Mapping[Aircraft, Remark | None]) -> None:
     """Replace what was recorded of some aircraft; None: there is nothing to remark any more."""
+    if not changed:
+        return
     key = tuple_(remarks.c.intent, remarks.c.track_id)
     connection.execute(delete(remarks).where(key.in_([tuple(aircraft) for aircraft in changed])))
     rows = [

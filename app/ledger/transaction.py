@@ -192,8 +192,13 @@ class Transaction:
         return positions.remarked(self._connection)
 
     @_asking()
+    def forget_remarks(self, aircraft: Iterable[Aircraft]) -> None:
+        """Drop what is recorded of aircraft that are gone."""
+        positions.remark(self._connection, dict.fromkeys(aircraft))
+
+    @_asking()
     def remark(self, changes: Mapping[Aircraft, Remark | None], now_ms: int) -> None:
-        """Record what is remarked of aircraft; None: nothing any more."""
+        """Record what is remarked of aircraft, in the journal too; None: they conform again."""
         self.flush()
         ids = self.ids(aircraft.sequence for aircraft in changes if aircraft.sequence)
         for aircraft, remark in changes.items():

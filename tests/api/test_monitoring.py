@@ -244,7 +244,9 @@ def test_what_has_not_changed_is_not_recorded_again(lanes: Client, clock: FakeCl
     assert told(lanes) == before
 
 
-def test_a_track_comes_and_goes_in_the_journal(lanes: Client, clock: FakeClock) -> None:
+def test_a_track_comes_and_is_lost_in_the_journal_and_goes_without_having_conformed(
+    lanes: Client, clock: FakeClock
+) -> None:
     see(lanes, "radar-1", 3.5, 1.5)
     for seconds in (0, 6, 60):
         clock.advance(seconds=seconds)
@@ -252,7 +254,6 @@ def test_a_track_comes_and_goes_in_the_journal(lanes: Client, clock: FakeClock) 
     assert told(lanes) == [
         ("deviating", "radar-1", ["no_flight_intent"]),
         ("lost", "radar-1", ["lost"]),
-        ("conforming", "radar-1", []),
     ]
     (first, *_) = lanes.get("/v1/events").json()["items"]
     assert first == {

@@ -86,12 +86,12 @@ class Watched:
 
 
 def yellow(pixels: npt.NDArray[np.int64]) -> int:
-    """Return how many pixels are of the yellow of deviations."""
+    """Return how many pixels are of the yellow of deviations, pure or seen through."""
     red, green, blue = np.moveaxis(pixels, -1, 0)
-    return int(((red > 170) & (green > 140) & (blue < 110)).sum())
+    return int(((red - blue > 50) & (green - blue > 40)).sum())
 
 
 def vermilion(pixels: npt.NDArray[np.int64]) -> int:
-    """Return how many pixels are of the red of conflicts."""
+    """Return how many pixels are of the red of conflicts, pure or seen through."""
     red, green, blue = np.moveaxis(pixels, -1, 0)
-    return int(((red > 190) & (green < 130) & (blue < 90)).sum())
+    return int(((red - green > 50) & (red - blue > 50)).sum())
