@@ -22,6 +22,8 @@ from planner.airspace import Airspace
 
 log = structlog.get_logger()
 
+# In these a flight becomes contingent after a while.
+_SEVERE = frozenset({Conformance.LOST.value, Conformance.VIOLATING.value})
 # So many changes are recorded at once, and so many flights ended that were never seen: nobody waits long for that.
 _CHANGE_AT_ONCE, _END_AT_ONCE = 64, 256
 # A flight is shown from so long before its departure, a track until so long after it was last seen.
@@ -177,7 +179,7 @@ class Monitor:
         for aircraft, assessment in view.assessed.items():
             before = remarks.get(aircraft)
             after = _remark(assessment, before, now)
-            is_severe = after is not None and after.conformance in (Conformance.LOST, Conformance.VIOLATING)
+            is_severe = after is not None and after.conformance in _SEVERE
             since_ms = after.since_ms if after is not None and is_severe else None
             state = move(assessment, since_ms, now, self._thresholds)
             is_over = state is State.ENDED
@@ -209,7 +211,9 @@ def _remark(assessment: Assessment, before: Remark | None, now: int) -> Remark |
     conformance = assessment.conformance.value
     if before is None:
         return Remark(conformance, reasons, now, now)
-    since_ms = before.since_ms if before.conformance == conformance else now
+    # How long somebody is lost or violating counts together.
+    is_same = before.conformance == conformance or {before.conformance, conformance} <= _SEVERE
+    since_ms = before.since_ms if is_same else now
     return Remark(conformance, reasons, since_ms, before.raised_ms)
 
 

@@ -104,7 +104,7 @@ class Reach:
 class AirPicture:
     """The air at one time. `held` are the reservations from shortly before it until shortly after it.
 
-    Where `is_forecast`, the time lies ahead: nobody can have been seen there, and nobody is missed.
+    Where `is_forecast`, no positions are known, for the time lies ahead or they are no longer kept: nobody is missed.
     """
 
     at_ms: int

@@ -90,7 +90,7 @@ class Telemetry:
             else:
                 entries[index] = UnknownFlight(f"there is no flight intent {report.flight_intent_id}")
         if known:
-            request = self._writer.enqueue(lambda transaction, _: self._store(transaction, known), lambda: None)
+            request = self._writer.enqueue(lambda transaction, now: self._store(transaction, now, known), lambda: None)
             for (index, _, _), entry in zip(known, request.future.result(), strict=True):
                 entries[index] = entry
         return Receipt(entries)
@@ -121,13 +121,16 @@ class Telemetry:
         return False
 
     def _store(
-        self, transaction: Transaction, known: Sequence[tuple[int, Aircraft, Sighting]]
+        self, transaction: Transaction, now: int, known: Sequence[tuple[int, Aircraft, Sighting]]
     ) -> list[PositionRefused | bool]:
         newest = transaction.newest_positions(aircraft for _, aircraft, _ in known)
         entries: list[PositionRefused | bool] = []
         new: list[tuple[Aircraft, Sighting]] = []
         for _, aircraft, sighting in known:
             last = newest.get(aircraft)
+            if last is not None and last.time_ms > now + self._ahead_ms:
+                # Recorded while the clock was wrong: it would refuse all there is until then.
+                last = None
             if last is not None and sighting.time_ms <= last.time_ms:
                 is_known = _same(sighting, last)
                 entries.append(last.is_implausible if is_known else _out_of_order(sighting, last))

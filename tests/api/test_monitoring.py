@@ -188,6 +188,22 @@ def test_a_flight_that_violates_for_half_a_minute_is_contingent(lanes: Client, c
 
 
 @on_sqlite
+def test_being_lost_and_violating_count_together(lanes: Client, clock: FakeClock) -> None:
+    flight = activated(lanes)
+    clock.now_ms = DEPARTURE_MS
+    fly(lanes, flight)
+    clock.advance(ms=FRESHNESS_MS + 1)
+    look(lanes)
+    for _ in range(5):
+        # Back, but in a block that somebody else is in.
+        clock.advance(seconds=6)
+        see(lanes, flight, 0.5, 1.5)
+        see(lanes, "radar-1", 0.6, 1.5)
+        look(lanes)
+    assert (state_of(lanes, flight), flights(lanes)[flight]["conformance"]) == ("contingent", "violating")
+
+
+@on_sqlite
 def test_a_flight_that_only_deviates_is_never_contingent(lanes: Client, clock: FakeClock) -> None:
     flight = activated(lanes)
     clock.now_ms = DEPARTURE_MS

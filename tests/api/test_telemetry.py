@@ -270,6 +270,17 @@ def test_another_position_of_the_same_moment_is_refused(client: Client) -> None:
     assert tracks(client)["radar-1"]["position"]["block"] == [0, 4, 0]
 
 
+def test_positions_of_a_clock_that_was_ahead_and_was_set_back_do_not_keep_out_newer_ones(
+    client: Client, clock: FakeClock
+) -> None:
+    clock.advance(seconds=3_600)
+    send(client, seen(START_MS + 3_600_000))
+    clock.advance(seconds=-3_600)
+    assert send(client, seen(START_MS))["accepted"] == 1
+    assert slugs(send(client, seen(START_MS - 1))) == {0: "position-out-of-order"}
+    assert tracks(client)["radar-1"]["position"]["time"] == format_time(START_MS)
+
+
 def test_positions_of_one_report_count_in_their_order(client: Client) -> None:
     answer = send(client, seen(START_MS - 2), seen(START_MS), seen(START_MS - 1), seen(START_MS, "B"))
     assert (answer["accepted"], slugs(answer)) == (2, {2: "position-out-of-order", 3: "position-out-of-order"})

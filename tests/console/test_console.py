@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from app.times import format_time
-from tests.console.browser import Watched
+from tests.console.browser import Watched, yellow
 from tests.console.quarter import ATTRIBUTION, Quarter
 
 if TYPE_CHECKING:
@@ -149,3 +149,23 @@ def test_nothing_is_cut_off(browser: "Browser", served: Quarter, size: tuple[int
     assert watched.run("() => document.documentElement.dataset.theme") == "light"
     assert watched.run("() => document.documentElement.scrollHeight <= innerHeight")
     watched.close()
+
+
+def test_a_graphics_context_that_is_lost_comes_back(console: Watched, served: Quarter) -> None:
+    served.report((2, 9, 2), track_id="lasting")
+    console.page.locator("#alerts-list button", has_text="lasting").wait_for()
+    console.page.wait_for_timeout(500)
+    before = yellow(console.pixels())
+    console.run(
+        """() => {
+            globalThis.context = document.querySelector("canvas.scene").getContext("webgl2")
+                .getExtension("WEBGL_lose_context");
+            context.loseContext();
+        }"""
+    )
+    console.page.wait_for_timeout(500)
+    assert yellow(console.pixels()) < before
+    console.run("() => context.restoreContext()")
+    console.page.wait_for_timeout(800)
+    assert yellow(console.pixels()) == pytest.approx(before, rel=0.2)
+    assert console.complaints == []

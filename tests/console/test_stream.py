@@ -24,6 +24,7 @@ def test_loss_and_return_of_the_stream_are_shown(browser: "Browser", tmp_path: P
         page.click("#tab-flights")
         page.locator("#flights-list strong", has_text="STAYS").wait_for()
         assert page.locator("#stale").is_hidden()
+        served_revision = served.get("/v1/events")["items"][-1]["revision"]
         port = served.url.rpartition(":")[2]
         served.server.stop(signal.SIGTERM)
 
@@ -33,10 +34,15 @@ def test_loss_and_return_of_the_stream_are_shown(browser: "Browser", tmp_path: P
         # What was known last is still there.
         assert page.locator("#flights-list strong", has_text="STAYS").count() == 1
 
+        asked: list[str | None] = []
+        page.on("request", lambda request: asked.append(request.headers.get("last-event-id")))
         airspace = str(tmp_path / "quarter.geojson")
         with started(tmp_path, "--port", port, "--airspace", airspace, log="again.log"):
             page.wait_for_selector('#link[data-state="live"]', timeout=_RETURN_MS)
             page.locator("#stale").wait_for(state="hidden")
+            # It asks for what it has missed.
+            assert asked
+            assert asked[-1] == str(served_revision)
             served.fly((0, 9, 0), (10, 9, 0), reference="COMES")
             page.locator("#flights-list strong", has_text="COMES").wait_for()
         console.close()
