@@ -77,8 +77,8 @@ def alerts(
 
 
 def _threats(aircraft: Aircraft, way: Way, held: HeldReservations, at_ms: int) -> tuple[Threat, ...]:
-    """Return whose reservations an aircraft would enter; `held` are by block."""
-    threats = set()
+    """Return whose reservations an aircraft would enter, the soonest of each flight; `held` are by block."""
+    threats: dict[int, Threat] = {}
     first = np.searchsorted(held.block, way.block, side="left").tolist()
     last = np.searchsorted(held.block, way.block, side="right").tolist()
     for step, (block, begins, ends) in enumerate(
@@ -88,8 +88,13 @@ def _threats(aircraft: Aircraft, way: Way, held: HeldReservations, at_ms: int) -
             sequence, enter, leave = int(held.sequence[row]), int(held.enter_ms[row]), int(held.exit_ms[row])
             reach_ms = max(begins, enter, at_ms)
             if max(enter, at_ms) < ends and leave > reach_ms and Aircraft(sequence) != aircraft:
-                threats.add(Threat(sequence, block, enter, leave, reach_ms))
-    return tuple(sorted(threats, key=lambda threat: (threat.reach_ms, threat.sequence, threat.block)))
+                found = Threat(sequence, block, enter, leave, reach_ms)
+                threats[sequence] = min(found, threats.get(sequence, found), key=_soonest)
+    return tuple(sorted(threats.values(), key=_soonest))
+
+
+def _soonest(threat: Threat) -> tuple[int, int, int]:
+    return threat.reach_ms, threat.sequence, threat.block
 
 
 def swept(sighting: Sighting, grid: AirMatrix, until_ms: int) -> Way:

@@ -146,7 +146,7 @@ def _flight(
     if sighting is None:
         reasons = (Reason.NOT_SEEN,) if is_due and flight.state in OPEN_STATES else ()
         return Assessment(aircraft, flight, None, Conformance.UNSEEN, reasons)
-    is_fresh = now - sighting.time_ms <= thresholds.freshness_ms
+    is_fresh = -tolerance_ms <= now - sighting.time_ms <= thresholds.freshness_ms
     if not is_airborne(flight, sighting):
         return _on_the_ground(
             aircraft, flight, sighting, is_due=is_due, is_fresh=is_fresh, is_on_reservation=is_on_reservation

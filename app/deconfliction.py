@@ -118,7 +118,10 @@ class OccupancyReplica:
 
 
 class Deconfliction:
-    """Plans, records and cancels flights by way of the writer; `horizon_ms` is how far ahead they may depart."""
+    """Plans, records and changes flights by way of the writer.
+
+    `horizon_ms` is how far ahead they may depart, `freshness_ms` for how long a position says where an aircraft is.
+    """
 
     def __init__(
         self,
@@ -127,12 +130,14 @@ class Deconfliction:
         planner: Planner,
         performances: Mapping[str, Performance],
         horizon_ms: int,
+        freshness_ms: int,
     ) -> None:
         self._writer = writer
         self._ledger = ledger
         self._planner = planner
         self._performances = performances
         self._horizon_ms = horizon_ms
+        self._freshness_ms = freshness_ms
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to two blocks whatever the traffic. Safe in any thread."""
@@ -224,9 +229,7 @@ class Deconfliction:
         if intent.state not in OPEN_STATES or intent.trajectory is None:
             raise IllegalTransition(f"flight intent {intent.id} is {intent.state} and cannot become {state}")
         is_over = state in (State.ENDED, State.CANCELLED)
-        is_free = is_over and (
-            now < intent.trajectory.departure_ms or _has_landed(transaction, intent, intent.trajectory.departure_ms)
-        )
+        is_free = is_over and self._is_down(transaction, now, intent, intent.trajectory)
         changed = transaction.change(intent, state, now, is_free=is_free)
         if is_free:
             freed, kept = intent.reservations.beyond(now), changed.reservations.beyond(now)
@@ -304,6 +307,19 @@ class Deconfliction:
             )
         return self.move(transaction, now, intent, State.CANCELLED)
 
+    def _is_down(self, transaction: Transaction, now: int, intent: FlightIntent, trajectory: Trajectory) -> bool:
+        """Tell whether a flight's aircraft is known not to be in the air: it should not have departed yet and was not
+        seen flying; or it was reported on the ground, where it was to land, or just now.
+        """
+        aircraft = Aircraft(intent.sequence)
+        seen = transaction.newest_positions([aircraft]).get(aircraft)
+        if now < trajectory.departure_ms:
+            return seen is None or seen.airborne is not True
+        if seen is None or seen.airborne is not False or seen.time_ms < trajectory.departure_ms:
+            return False
+        block = int(self._planner.airspace.grid.blocks_at(seen.lon, seen.lat, seen.alt_m)[0])
+        return block == trajectory.block[-1] or now - seen.time_ms <= self._freshness_ms
+
     def _activate(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
         intent = _found(transaction, intent_id)
         if intent.activated_ms is not None and intent.state in (State.ACTIVATED, State.NONCONFORMING):
@@ -325,13 +341,6 @@ def _found(transaction: Transaction, intent_id: str) -> FlightIntent:
     if intent is None:
         raise UnknownFlightIntent(f"there is no flight intent {intent_id}")
     return intent
-
-
-def _has_landed(transaction: Transaction, intent: FlightIntent, departure_ms: int) -> bool:
-    """Tell whether a flight's aircraft was reported on the ground after its departure, and not in the air since."""
-    aircraft = Aircraft(intent.sequence)
-    seen = transaction.newest_positions([aircraft]).get(aircraft)
-    return seen is not None and seen.airborne is False and seen.time_ms >= departure_ms
 
 
 def log_intents(report: BatchReport) -> None:

@@ -1,8 +1,10 @@
 """Conformance monitoring: looks at the air every second, records what changed, moves states that move by themselves."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -24,8 +26,11 @@ log = structlog.get_logger()
 
 # In these a flight becomes contingent after a while.
 _SEVERE = frozenset({Conformance.LOST.value, Conformance.VIOLATING.value})
-# So many changes are recorded at once, and so many flights ended that were never seen: nobody waits long for that.
-_CHANGE_AT_ONCE, _END_AT_ONCE = 64, 256
+# So many changes are recorded at once, and so many flights ended that were never seen: nobody waits long for that. So
+# often in one look.
+_PART, _END_AT_ONCE, _ENDS = 64, 256, 8
+# The writer takes a few milliseconds for all that, unless it waits for others or for the ledger.
+_PATIENCE_S = 0.5
 # A flight is shown from so long before its departure, a track until so long after it was last seen.
 _DUE_MS, _TRACK_MS = 60_000, 60_000
 
@@ -92,6 +97,7 @@ class Monitor:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._latest: View | None = None
+        self._pending: list[Future[Moved]] = []
 
     def start(self, every_s: float) -> None:
         """Begin to look, at intervals by the system's clock."""
@@ -137,8 +143,11 @@ class Monitor:
         """What was seen last, None before the first look."""
         return self._latest
 
-    def look(self) -> View:
-        """Judge the present, record what has changed, and return it as it was judged.
+    def look(self, patience_s: float | None = None) -> View:
+        """Judge the present, have recorded what has changed, and return it as it was judged.
+
+        Whoever watches sees it when it is recorded, or after `patience_s` (None: as long as it takes) if the writer has
+        not got round to it by then; until it has, nothing further is recorded.
 
         Raises
         ------
@@ -146,27 +155,44 @@ class Monitor:
         """
         began = time.perf_counter()
         view = self.view()
-        if self._writing is not None:
-            writer, deconfliction = self._writing
-            changes = self._changes(view)
-            for start in range(0, len(changes), _CHANGE_AT_ONCE):
-                part = changes[start : start + _CHANGE_AT_ONCE]
-                writer.enqueue(partial(_record, deconfliction, part), lambda: Moved(())).future.result()
-            self._end_unseen(writer, view.at_ms)
-        self._latest = view
-        self._observe(time.perf_counter() - began)
+        try:
+            if self._writing is not None and not any(not future.done() for future in self._pending):
+                self._pending = []
+                self._record(view, *self._writing)
+                done, _ = wait(self._pending, patience_s)
+                for future in done:
+                    future.result()
+        finally:
+            self._latest = view
+            self._observe(time.perf_counter() - began)
         return view
 
     def _run(self, every_s: float) -> None:
+        settled_s = time.monotonic() + self._thresholds.freshness_ms / 1000
         while not self._stopping.wait(every_s):
             try:
-                self.look()
+                if time.monotonic() < settled_s:
+                    # Nobody could report while nobody listened: that somebody is lost cannot be said yet.
+                    self._latest = self.view()
+                else:
+                    self.look(_PATIENCE_S)
             except (LedgerUnavailable, QueueFull) as error:
                 with suppress(OSError, ValueError):
                     log.warning("conformance is not monitored", error=str(error))
             except Exception as error:
                 with suppress(OSError, ValueError):
                     log.error("conformance monitoring failed", exc_info=error)
+
+    def _record(self, view: View, writer: Writer, deconfliction: Deconfliction) -> None:
+        """Hand what has changed to the writer, in parts, so that planning goes on in between."""
+        changes = self._changes(view)
+        slices = [changes[start : start + _PART] for start in range(0, len(changes), _PART)]
+        parts = [partial(_record, deconfliction, part) for part in slices]
+        before_ms = view.at_ms - self._thresholds.tolerance_ms
+        unseen = self._ledger.unseen(before_ms, _END_AT_ONCE * _ENDS)
+        parts += [partial(_end, before_ms)] * math.ceil(unseen / _END_AT_ONCE)
+        for part in parts:
+            self._pending.append(writer.enqueue(part, lambda: Moved(())).future)
 
     def _changes(self, view: View) -> list[Change]:
         remarks, now = view.picture.remarks, view.at_ms
@@ -189,14 +215,6 @@ class Monitor:
                 changes.append(Change(aircraft, assessment.flight, before, after, state, is_over))
         return changes
 
-    def _end_unseen(self, writer: Writer, now: int) -> None:
-        """End the flights that should have arrived and were never seen, some at a time."""
-        before_ms = now - self._thresholds.tolerance_ms
-        while self._ledger.unseen(before_ms, 1) and not self._stopping.is_set():
-            moved = writer.enqueue(partial(_end, before_ms), lambda: Moved(())).future.result()
-            if len(moved.flights) < _END_AT_ONCE:
-                return
-
 
 def _end(before_ms: int, transaction: Transaction, now: int) -> Moved:
     ended = transaction.end_unseen(before_ms, _END_AT_ONCE, now)
@@ -213,13 +231,14 @@ def _remark(assessment: Assessment, before: Remark | None, now: int) -> Remark |
         return Remark(conformance, reasons, now, now)
     # How long somebody is lost or violating counts together.
     is_same = before.conformance == conformance or {before.conformance, conformance} <= _SEVERE
-    since_ms = before.since_ms if is_same else now
-    return Remark(conformance, reasons, since_ms, before.raised_ms)
+    # What was recorded while the clock was ahead began now.
+    since_ms = min(before.since_ms, now) if is_same else now
+    return Remark(conformance, reasons, since_ms, min(before.raised_ms, now))
 
 
 def _record(deconfliction: Deconfliction, changes: Sequence[Change], transaction: Transaction, now: int) -> Moved:
     """Write down changes that nobody else has written down already; return the flights that moved."""
-    present = transaction.remarks()
+    present = transaction.remarks(change.aircraft for change in changes)
     current = [change for change in changes if present.get(change.aircraft) == change.before]
     moved = []
     for change in current:

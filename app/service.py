@@ -197,8 +197,7 @@ def started(
             None if writing is None else (writing.writer, writing.deconfliction),
             metrics.looked,
         )
-        if settings.monitor_every_s:
-            monitor.start(settings.monitor_every_s)
+        monitor.start(settings.monitor_every_s)
         try:
             yield Service(
                 settings=settings,
@@ -254,7 +253,8 @@ def _writing(
         on_death=on_death,
     )
     horizon_ms = int(settings.horizon_days * 86_400_000)
-    deconfliction = Deconfliction(writer, ledger, planner, basis.performances(), horizon_ms)
+    freshness_ms = _thresholds(settings).freshness_ms
+    deconfliction = Deconfliction(writer, ledger, planner, basis.performances(), horizon_ms, freshness_ms)
     telemetry = Telemetry(
         ledger,
         writer,

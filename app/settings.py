@@ -45,8 +45,8 @@ class Settings(BaseSettings):
     contingent_after_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 30.0
     # How far ahead a deviating flight is looked after.
     projection_s: Annotated[float, Field(gt=0, le=3_600)] = 60.0
-    # How often the air is looked at; 0: this process does not do it.
-    monitor_every_s: Annotated[float, Field(ge=0, le=60)] = 1.0
+    # How often a process looks at the air.
+    monitor_every_s: Annotated[float, Field(ge=0.1, le=3_600)] = 1.0
     telemetry_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 1.0
 
     # For demonstrations and tests only: a clock that is set, and may run faster than time.

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from anyio import to_thread
 
 from app.errors import (
     PositionInTheFuture,
@@ -24,8 +25,8 @@ from planner.airmatrix import AirMatrix
 _REMOTE_M = 20_000.0
 # Faster than any aircraft that flies between blocks of a city.
 _IMPLAUSIBLE_MPS = 60.0
-# A velocity is that between two positions no further apart than this.
-_VELOCITY_WITHIN_MS = 10_000
+# A velocity is that between two positions as far apart as this.
+_VELOCITY_BEYOND_MS, _VELOCITY_WITHIN_MS = 500, 10_000
 # Metres of a degree of latitude; good to half a percent, and positions are not better.
 _DEGREE_M = 111_320.0
 
@@ -66,8 +67,8 @@ class Telemetry:
         self._ahead_ms = ahead_ms
         self._kept_ms = kept_ms
 
-    def report(self, reports: Sequence[Report]) -> Receipt:
-        """Record positions, and return when they are durable; not for the event loop.
+    async def report(self, reports: Sequence[Report]) -> Receipt:
+        """Record positions, and return when they are durable.
 
         What was recorded before is not recorded again, so a report may be repeated.
 
@@ -76,7 +77,21 @@ class Telemetry:
         QueueFull, LedgerUnavailable, OutcomeUnknown
             Nothing is known to be recorded.
         """
-        entries: list[PositionRefused | bool] = list(self._checked(reports))
+        # No thread waits for the writer: there are only so many, and reads need them.
+        entries, known = await to_thread.run_sync(self._known, reports)
+        if known:
+            stored = await self._writer.perform(
+                lambda transaction, now: self._store(transaction, now, known), lambda: None
+            )
+            for (index, _, _), entry in zip(known, stored, strict=True):
+                entries[index] = entry
+        return Receipt(entries)
+
+    def _known(
+        self, reports: Sequence[Report]
+    ) -> tuple[list[PositionRefused | bool], list[tuple[int, Aircraft, Sighting]]]:
+        """Return what is wrong with each position, and those with which nothing is by index, of whom and what."""
+        entries = self._checked(reports)
         ids = [report.flight_intent_id for report in reports if report.flight_intent_id is not None]
         sequences = self._ledger.sequences(ids)
         known: list[tuple[int, Aircraft, Sighting]] = []
@@ -89,11 +104,7 @@ class Telemetry:
                 known.append((index, Aircraft(sequences[report.flight_intent_id]), report.sighting))
             else:
                 entries[index] = UnknownFlight(f"there is no flight intent {report.flight_intent_id}")
-        if known:
-            request = self._writer.enqueue(lambda transaction, now: self._store(transaction, now, known), lambda: None)
-            for (index, _, _), entry in zip(known, request.future.result(), strict=True):
-                entries[index] = entry
-        return Receipt(entries)
+        return entries, known
 
     def _checked(self, reports: Sequence[Report]) -> list[PositionRefused | bool]:
         """Return what is wrong with each position by itself, False where that is nothing."""
@@ -160,6 +171,9 @@ def _moved(sighting: Sighting, last: Sighting | None) -> Sighting:
     """Return a position with the velocity since the last one, and whether that is one no aircraft has."""
     if last is None:
         return sighting
+    if sighting.time_ms - last.time_ms < _VELOCITY_BEYOND_MS:
+        # Too short a way: mostly noise.
+        return replace(sighting, velocity=last.velocity)
     seconds = (sighting.time_ms - last.time_ms) / 1000
     metres = Velocity(
         (sighting.lon - last.lon) * _DEGREE_M * math.cos(math.radians(sighting.lat)),

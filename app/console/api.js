@@ -1,7 +1,7 @@
 /** Requests to the service. The only place that calls fetch. */
 
 /** What went wrong: `problem` is the answer's problem document (RFC 9457), null where there was no answer. */
-export class RequestFailed extends Error {
+class RequestFailed extends Error {
   constructor(message, problem = null) {
     super(message);
     this.problem = problem;

@@ -34,14 +34,10 @@ export class LocalFrame {
   }
 }
 
-/** Return clip coordinates `[x, y, z, w]` of a local position. */
-export function toClip(matrix, [x, y, z]) {
-  return [0, 1, 2, 3].map((row) => matrix[row] * x + matrix[4 + row] * y + matrix[8 + row] * z + matrix[12 + row]);
-}
-
 /** Return where a local position is on a canvas of this size in pixels, or null behind the camera. */
-export function toScreen(matrix, position, width, height) {
-  const [x, y, , w] = toClip(matrix, position);
+export function toScreen(matrix, [east, north, up], width, height) {
+  const clip = (row) => matrix[row] * east + matrix[4 + row] * north + matrix[8 + row] * up + matrix[12 + row];
+  const [x, y, w] = [clip(0), clip(1), clip(3)];
   return w > 0 ? [(1 + x / w) * (width / 2), (1 - y / w) * (height / 2)] : null;
 }
 

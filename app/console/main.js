@@ -68,7 +68,9 @@ class Console {
     this.#listenToPicture();
     this.#openTab("alerts");
     setInterval(() => this.#refresh(), REFRESH_MS);
-    setInterval(() => this.#moment ?? this.#showHeat(), HEAT_MS);
+    setInterval(() => {
+      if (this.#filters.heatSpan !== null && this.#moment === null) this.#showHeat();
+    }, HEAT_MS);
     requestAnimationFrame((at) => this.#animate(at));
     this.#newFlight.load().catch((error) => this.#notice(`Aircraft types: ${error.message}`));
     follow({

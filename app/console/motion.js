@@ -69,7 +69,7 @@ function metres(one, other) {
 }
 
 /** Return the heading of a velocity, null where it is too slow to have one. */
-export function headingOf(velocity) {
+function headingOf(velocity) {
   if (!velocity || Math.hypot(velocity.east, velocity.north) < 0.5) return null;
   return Math.atan2(velocity.east, velocity.north);
 }

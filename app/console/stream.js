@@ -71,8 +71,9 @@ function deliver(onEvent, event, data) {
 
 /** Wait, but not longer than until the network is said to be back. */
 function wait(ms) {
+  const over = new AbortController();
   return new Promise((resolve) => {
     setTimeout(resolve, ms);
-    addEventListener("online", resolve, { once: true });
-  });
+    addEventListener("online", resolve, { signal: over.signal });
+  }).finally(() => over.abort());
 }

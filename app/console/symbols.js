@@ -14,7 +14,7 @@ export function symbolOf(flight) {
 }
 
 /** Draw a symbol into a square of `size` pixels whose corner is at (x, y); it points up. */
-export function drawSymbol(context, symbol, colours, x, y, size) {
+function drawSymbol(context, symbol, colours, x, y, size) {
   const half = size / 2;
   context.save();
   context.translate(x + half, y + half);

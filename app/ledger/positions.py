@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, and_, delete, func, insert, or_, select,
 
 from app.flight_intents import HeldReservations, State
 from app.ledger.queries import BOUND_AT_ONCE, in_the_air
-from app.ledger.rows import to_held
+from app.ledger.rows import joined_held, to_held
 from app.ledger.tables import (
     counters,
     flight_intents,
@@ -38,6 +38,13 @@ _UPSERT = text(
     " time = excluded.time, lon = excluded.lon, lat = excluded.lat, alt_m = excluded.alt_m,"
     " airborne = excluded.airborne, implausible = excluded.implausible,"
     " east_mps = excluded.east_mps, north_mps = excluded.north_mps, up_mps = excluded.up_mps"
+)
+# A second position of one moment comes only after the clock was set back.
+_HISTORY = text(
+    "INSERT INTO position_history (intent, track_id, time, lon, lat, alt_m, airborne)"
+    " VALUES (:intent, :track_id, :time, :lon, :lat, :alt_m, :airborne)"
+    " ON CONFLICT (intent, track_id, time) DO UPDATE SET"
+    " lon = excluded.lon, lat = excluded.lat, alt_m = excluded.alt_m, airborne = excluded.airborne"
 )
 _HISTORY_COLUMNS = tuple(column.name for column in position_history.c)
 
@@ -66,7 +73,7 @@ def store(connection: Connection, reports: Sequence[tuple[Aircraft, Sighting]]) 
         return
     rows = [_row(aircraft, sighting) for aircraft, sighting in reports]
     connection.execute(_UPSERT, list({(row["intent"], row["track_id"]): row for row in rows}.values()))
-    connection.execute(insert(position_history), [{name: row[name] for name in _HISTORY_COLUMNS} for row in rows])
+    connection.execute(_HISTORY, [{name: row[name] for name in _HISTORY_COLUMNS} for row in rows])
 
 
 def remove(connection: Connection, before_ms: int, limit: int) -> int:
@@ -109,13 +116,16 @@ def remark(connection: Connection, changed: Mapping[Aircraft, Remark | None]) ->
         connection.execute(insert(remarks), rows)
 
 
-def remarked(connection: Connection) -> dict[Aircraft, Remark]:
-    """Return all that is recorded of aircraft that do not simply conform."""
+def remarked(connection: Connection, aircraft: Iterable[Aircraft] | None = None) -> dict[Aircraft, Remark]:
+    """Return what is recorded of aircraft that do not simply conform: of all, or of some."""
+    query = select(remarks)
+    if aircraft is not None:
+        query = query.where(tuple_(remarks.c.intent, remarks.c.track_id).in_([tuple(each) for each in aircraft]))
     return {
         Aircraft(row.intent, row.track_id): Remark(
             row.conformance, tuple(json.loads(row.reasons)), row.since, row.raised
         )
-        for row in connection.execute(select(remarks))
+        for row in connection.execute(query)
     }
 
 
@@ -175,17 +185,27 @@ def unseen(connection: Connection, before_ms: int, limit: int) -> list[tuple[int
 
 
 def held_in(connection: Connection, blocks: Sequence[int], from_ms: int, to_ms: int) -> HeldReservations:
-    """Return the reservations of some blocks that overlap [from, to)."""
-    query = select(reservations).where(
-        reservations.c.block.in_(blocks), reservations.c.enter < to_ms, reservations.c.exit > from_ms
-    )
-    return to_held(connection.execute(query.order_by(reservations.c.block, reservations.c.enter)))
+    """Return the reservations of some blocks that overlap [from, to), by block and enter."""
+    held = reservations.c
+    # A reservation is no longer than the longest flight: nothing older is looked at.
+    longest_ms = select(counters.c.longest_flight).scalar_subquery()
+    overlaps = and_(held.enter >= from_ms - longest_ms - 1, held.enter < to_ms, held.exit > from_ms)
+    query = select(reservations).where(overlaps, in_the_air(from_ms, to_ms)).order_by(held.block, held.enter)
+    parts = [
+        to_held(connection.execute(query.where(held.block.in_(blocks[start : start + BOUND_AT_ONCE]))))
+        for start in range(0, len(blocks), BOUND_AT_ONCE)
+    ]
+    return parts[0] if len(parts) == 1 else joined_held(parts)
 
 
 def _due(connection: Connection, at_ms: int, due_before_ms: int) -> list[int]:
     """Return the open flights that fly now or are due to; of those that should have arrived, the ones ever seen."""
     flight = flight_intents.c
-    flying = select(flight.sequence).where(_OPEN, flight.arrival >= at_ms, flight.departure < due_before_ms)
+    # Bounded above too: all that is planned for later stands in the same index.
+    latest_ms = due_before_ms + select(counters.c.longest_flight).scalar_subquery()
+    flying = select(flight.sequence).where(
+        _OPEN, flight.arrival >= at_ms, flight.arrival < latest_ms, flight.departure < due_before_ms
+    )
     seen = select(newest_positions.c.intent).where(newest_positions.c.intent == flight.sequence).exists()
     overdue = select(flight.sequence).where(_OPEN, flight.arrival < at_ms, seen)
     return [*connection.execute(flying).scalars(), *connection.execute(overdue).scalars()]

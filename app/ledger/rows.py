@@ -111,6 +111,17 @@ def joined(intents: Sequence[FlightIntent]) -> HeldReservations:
     )
 
 
+def joined_held(parts: Sequence[HeldReservations]) -> HeldReservations:
+    """Return several sets of columns, or none, as one."""
+    none = np.empty(0, dtype=np.int64)
+    return HeldReservations(
+        np.concatenate([none, *(part.block for part in parts)]),
+        np.concatenate([none, *(part.enter_ms for part in parts)]),
+        np.concatenate([none, *(part.exit_ms for part in parts)]),
+        np.concatenate([none, *(part.sequence for part in parts)]),
+    )
+
+
 def by_intent(held: HeldReservations, sequences: Sequence[int], grid: AirMatrix) -> dict[int, Reservations]:
     """Return the reservations of each of these intents, sorted by enter, then i, j, k; none for who holds none."""
     i, j, k = grid.ijk(held.block).T

@@ -187,9 +187,9 @@ class Transaction:
         positions.store(self._connection, reports)
 
     @_asking()
-    def remarks(self) -> dict[Aircraft, Remark]:
-        """Return what is recorded of aircraft that do not simply conform."""
-        return positions.remarked(self._connection)
+    def remarks(self, aircraft: Iterable[Aircraft]) -> dict[Aircraft, Remark]:
+        """Return what is recorded of some aircraft, those that do not simply conform."""
+        return positions.remarked(self._connection, aircraft)
 
     @_asking()
     def forget_remarks(self, aircraft: Iterable[Aircraft]) -> None:

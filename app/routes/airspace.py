@@ -265,7 +265,7 @@ def read_occupancy(
     """Return how long each block is reserved within [from, to): the paper's heat map."""
     grid = service.airspace.grid
     start = service.clock() if from_ is None else from_
-    from_ms, to_ms = _span(start, start + _DEFAULT_SPAN_MS if to is None else to)
+    from_ms, to_ms = _span(start, min(start + _DEFAULT_SPAN_MS, LATEST_MS) if to is None else to)
     block, use_ms = service.ledger.use_between(from_ms, to_ms)
     indices, seconds = grid.ijk(block), use_ms / 1000
     if layer is not None:

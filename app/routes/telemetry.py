@@ -3,7 +3,8 @@
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Request
+from anyio import to_thread
+from fastapi import APIRouter, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, from_json
@@ -109,10 +110,6 @@ _BODY_SCHEMA = {
 _POSITIONS = TypeAdapter(list[PositionReport])
 
 
-async def _body_of(request: Request) -> bytes:
-    return await request.body()
-
-
 @router.post(
     "",
     status_code=202,
@@ -125,14 +122,15 @@ async def _body_of(request: Request) -> bytes:
     },
     summary="Report positions",
 )
-def report(service: ServiceDep, body: Annotated[bytes, Depends(_body_of)]) -> TelemetryAnswer:
-    """Record where aircraft were. The answer is sent when that is durable; a report may be repeated.
+async def report(service: ServiceDep, request: Request) -> TelemetryAnswer:
+    """Record where aircraft were. The answer is sent when that is durable; what is repeated is not recorded twice.
 
     Positions of the future, of another part of the world, of unknown flights or older than what is known are refused
     one by one. One that no aircraft can have reached from the last is taken, and flagged.
     """
-    positions, refused = _read(body)
-    receipt = service.telemetry.report([read for _, read in positions])
+    telemetry = service.telemetry
+    positions, refused = await to_thread.run_sync(_read, await request.body())
+    receipt = await telemetry.report([read for _, read in positions])
     flagged = []
     for (index, _), entry in zip(positions, receipt.entries, strict=True):
         if isinstance(entry, PositionRefused):

@@ -21,7 +21,7 @@ def settings_for(district: District, ledger: str, folder: Path, **options: objec
     """Return settings for a district, whose airspace file is written into a folder."""
     airspace = folder / "airspace.json"
     district.airspace.write(airspace)
-    return Settings.model_validate({"ledger": ledger, "airspace": airspace, "monitor_every_s": 0, **options})
+    return Settings.model_validate({"ledger": ledger, "airspace": airspace, "monitor_every_s": 3600, **options})
 
 
 @dataclass(frozen=True)
