@@ -46,6 +46,7 @@ class State(TypedDict):
     """What the lifespan hands to every request."""
 
     service: Service
+    board: stream.Board
 
 
 def create_app(
@@ -60,12 +61,12 @@ def create_app(
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[State]:
         if running is not None:
-            yield {"service": running}
+            yield {"service": running, "board": stream.Board()}
             return
         starting = service.running(settings, clock, elapsed_ms)
         started = await to_thread.run_sync(starting.__enter__)
         try:
-            yield {"service": started}
+            yield {"service": started, "board": stream.Board()}
         finally:
             await to_thread.run_sync(starting.__exit__, None, None, None)
 

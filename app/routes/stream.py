@@ -1,13 +1,14 @@
 """The air as it changes: Server-Sent Events for the console and whoever else watches."""
 
 import asyncio
-from collections.abc import AsyncIterator
-from dataclasses import dataclass, field, replace
+import threading
+from collections.abc import AsyncIterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import orjson
 from anyio import to_thread
-from fastapi import APIRouter, Header
+from fastapi import APIRouter, Header, Request
 from fastapi.sse import format_sse_event
 from starlette.responses import StreamingResponse
 
@@ -25,8 +26,112 @@ router = APIRouter(prefix="/v1/airspace", tags=["airspace"])
 
 # How often a stream looks whether the monitor has looked, and for how long it says nothing.
 _POLL_S, _SILENCE_S = 0.1, 10.0
-_ENTRIES = 500
+# Of the journal at once.
+_ENTRIES = 2_000
 _CONFORMANCE = frozenset(Conformance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bulletin:
+    """What there is to tell of a view: of the blocks in whole, or as the difference to what the view `before` had."""
+
+    view: View
+    before: View | None
+    blocks: Mapping[tuple[int, int, int], dict[str, Any]]
+    alerts: Sequence[dict[str, Any]]
+    whole: bytes
+    difference: bytes
+    flights: bytes
+    raised: bytes
+    raised_if_new: bytes
+
+    @classmethod
+    def of(cls, service: Service, view: View, last: "_Bulletin | None") -> "_Bulletin":
+        """Render a view after the last one."""
+        blocks = {tuple(entry["block"]): entry for entry in status.blocks(service, view, view.blocks)}
+        described = {**status.described(service, view), "counts": status.counts(view.blocks)}
+        before = {} if last is None else last.blocks
+        changed = [entry for block, entry in blocks.items() if before.get(block) != entry]
+        idle = [block for block in before if block not in blocks]
+        raised = flights.alerts(service, view, service.monitor.alerts(view))
+        alerts = _event("alerts", raised)
+        is_new = last is None or raised["items"] != last.alerts
+        return cls(
+            view=view,
+            before=None if last is None else last.view,
+            blocks=blocks,
+            alerts=raised["items"],
+            whole=_event("status", {**described, "full": True, "blocks": list(blocks.values())}),
+            difference=_event("status", {**described, "full": False, "blocks": changed, "idle": idle}),
+            flights=_event("flights", flights.flights(service, view)),
+            raised=alerts,
+            raised_if_new=alerts if is_new else b"",
+        )
+
+
+class Board:
+    """The newest bulletin, rendered once for all who watch."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._latest: _Bulletin | None = None
+
+    def bulletin(self, service: Service, view: View) -> _Bulletin:
+        """Return what there is to tell of a view; raises `LedgerUnavailable`."""
+        with self._lock:
+            if self._latest is None or self._latest.view is not view:
+                self._latest = _Bulletin.of(service, view, self._latest)
+            return self._latest
+
+
+@dataclass
+class _Watcher:
+    """One stream: what it has told so far, and whether the journal has more than was told at once."""
+
+    service: Service
+    board: Board
+    revision: int
+    told: View | None = None
+    is_behind: bool = False
+
+    def news(self, view: View) -> bytes:
+        """Return the events that tell what is new in the journal and in a view."""
+        journal = self._journal()
+        if view is self.told:
+            return journal
+        bulletin = self.board.bulletin(self.service, view)
+        is_next = self.told is not None and bulletin.before is self.told
+        blocks = bulletin.difference if is_next else _with_id(bulletin.whole, self.revision)
+        self.told = bulletin.view
+        return b"".join([journal, blocks, bulletin.flights, bulletin.raised_if_new if is_next else bulletin.raised])
+
+    def _journal(self) -> bytes:
+        ledger, events = self.service.ledger, []
+        removed = ledger.removed().journal_through
+        if self.revision < removed:
+            events.append(_event("gap", {"removed_through": removed}))
+        entries = ledger.journal_after(self.revision, _ENTRIES)
+        events += [_journal_event(entry) for entry in entries]
+        if entries:
+            self.revision = entries[-1].revision
+        self.is_behind = len(entries) == _ENTRIES
+        return b"".join(events)
+
+
+def _with_id(event: bytes, revision: int) -> bytes:
+    """Return an event with an id, so that who loses the stream at once resumes from there."""
+    return b"%sid: %d\n\n" % (event.removesuffix(b"\n"), revision)
+
+
+def _journal_event(entry: JournalEntry) -> bytes:
+    kind = "conformance" if entry.kind in _CONFORMANCE else "intent"
+    return _event(kind, {**event(entry).model_dump(mode="json"), "time": format_time(entry.time_ms)}, entry.revision)
+
+
+def _event(name: str, content: dict[str, Any], revision: int | None = None) -> bytes:
+    return format_sse_event(
+        event=name, data_str=orjson.dumps(content).decode(), id=None if revision is None else str(revision)
+    )
 
 
 @router.get(
@@ -39,6 +144,7 @@ _CONFORMANCE = frozenset(Conformance)
     summary="Watch the airspace",
 )
 async def watch(
+    request: Request,
     service: ServiceDep,
     last_event_id: Annotated[
         int | None, Header(ge=0, le=2**62, description="The revision after which to go on; default: now.")
@@ -50,21 +156,22 @@ async def watch(
     /v1/flights. `alerts`: as /v1/airspace/alerts, when they change. `intent` and `conformance`: the journal, whose
     revisions are the ids that `Last-Event-ID` resumes after; `gap` if retention has removed some of what was missed.
     """
+    board: Board = request.state.board
     revision = await to_thread.run_sync(service.ledger.revision)
     after = revision if last_event_id is None else min(last_event_id, revision)
     return StreamingResponse(
-        _events(service, after), media_type="text/event-stream", headers={"Cache-Control": "no-cache"}
+        _events(service, board, after), media_type="text/event-stream", headers={"Cache-Control": "no-cache"}
     )
 
 
-async def _events(service: Service, revision: int) -> AsyncIterator[bytes]:
+async def _events(service: Service, board: Board, revision: int) -> AsyncIterator[bytes]:
     """Yield events until the client goes or the server ends."""
-    watcher = _Watcher(service, revision)
+    watcher = _Watcher(service, board, revision)
     tried: View | None = None
     silent_s = 0.0
     while not service.closing.is_set():
         view = service.monitor.latest
-        if view is None or view is tried:
+        if view is None or (view is tried and not watcher.is_behind):
             await asyncio.sleep(_POLL_S)
             silent_s += _POLL_S
             if silent_s >= _SILENCE_S:
@@ -80,62 +187,3 @@ async def _events(service: Service, revision: int) -> AsyncIterator[bytes]:
             # Nothing of it was told; the next look tells it all.
             content = format_sse_event(comment=str(error))
         yield content
-
-
-@dataclass
-class _Watcher:
-    """One stream: what it has told so far."""
-
-    service: Service
-    revision: int
-    seen: View | None = None
-    blocks: dict[tuple[int, int, int], dict[str, Any]] = field(default_factory=dict)
-    alerts: list[dict[str, Any]] = field(default_factory=list)
-
-    def news(self, view: View) -> bytes:
-        """Return the events that tell what is new in a view, and in the journal."""
-        events = [self._journal(), self._status(view), _event("flights", flights.flights(self.service, view))]
-        raised = flights.alerts(self.service, view, self.service.monitor.alerts(view))
-        if raised["items"] != self.alerts or self.seen is None:
-            self.alerts = raised["items"]
-            events.append(_event("alerts", raised))
-        self.seen = view
-        return b"".join(events)
-
-    def _journal(self) -> bytes:
-        ledger, events = self.service.ledger, []
-        removed = ledger.removed().journal_through
-        if self.revision < removed:
-            events.append(_event("gap", {"removed_through": removed}))
-        while True:
-            entries = ledger.journal_after(self.revision, _ENTRIES)
-            events += [_journal_event(entry) for entry in entries]
-            if entries:
-                self.revision = entries[-1].revision
-            if len(entries) < _ENTRIES:
-                return b"".join(events)
-
-    def _status(self, view: View) -> bytes:
-        blocks = {tuple(entry["block"]): entry for entry in status.blocks(self.service, view, view.blocks)}
-        before, self.blocks = self.blocks, blocks
-        content = {
-            **status.described(self.service, view),
-            "full": self.seen is None,
-            "counts": status.counts(view.blocks),
-            "blocks": [entry for block, entry in blocks.items() if before.get(block) != entry],
-        }
-        if self.seen is None:
-            # With an id, so that who loses the stream at once resumes from here.
-            return _event("status", content, self.revision)
-        return _event("status", {**content, "idle": [block for block in before if block not in blocks]})
-
-
-def _journal_event(entry: JournalEntry) -> bytes:
-    kind = "conformance" if entry.kind in _CONFORMANCE else "intent"
-    return _event(kind, {**event(entry).model_dump(mode="json"), "time": format_time(entry.time_ms)}, entry.revision)
-
-
-def _event(name: str, content: dict[str, Any], revision: int | None = None) -> bytes:
-    return format_sse_event(
-        event=name, data_str=orjson.dumps(content).decode(), id=None if revision is None else str(revision)
-    )

@@ -12,6 +12,7 @@ import anyio
 from starlette.types import Message
 
 from app.main import create_app
+from app.routes.stream import Board
 from tests.api.serving import Client
 
 STREAM = "/v1/airspace/stream"
@@ -95,7 +96,7 @@ def streaming(client: Client, headers: dict[str, str] | None = None) -> Iterator
     scope = {
         "type": "http", "asgi": {"version": "3.0", "spec_version": "2.0"}, "http_version": "1.1", "method": "GET",
         "scheme": "http", "path": STREAM, "raw_path": STREAM.encode(), "query_string": b"", "headers": fields,
-        "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 50_000), "state": {"service": client.service},
+        "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 50_000), "state": {"service": client.service, "board": Board()},
     }  # fmt: skip
 
     async def receive() -> Message:

@@ -728,6 +728,11 @@ def test_an_alert_goes_with_its_cause(lanes: Client, clock: FakeClock) -> None:
 # Two processes
 
 
+def _wait(writers: list[Writer], count: int) -> bool:
+    """Tell whether so many pieces of work wait, with as many writers as there are."""
+    return all(writer.waiting for writer in writers[:count]) and sum(writer.waiting for writer in writers) >= count
+
+
 def all_at_once(ledger: str, writers: list[Writer], *work: Callable[[], object]) -> None:
     """Do work in threads of their own, whose writers find the ledger locked until all of it waits to be recorded."""
     for writer in writers:
@@ -740,9 +745,9 @@ def all_at_once(ledger: str, writers: list[Writer], *work: Callable[[], object])
             writer.enqueue(lambda *_: None, lambda: None)
         asyncio.run(until(lambda: not any(writer.waiting for writer in writers)))
         threads = [threading.Thread(target=task) for task in work]
-        for waiting, thread in enumerate(threads, start=1):
+        for count, thread in enumerate(threads, start=1):
             thread.start()
-            asyncio.run(until(lambda waiting=waiting: sum(writer.waiting for writer in writers) == waiting))  # type: ignore[misc]
+            asyncio.run(until(partial(_wait, writers, count)))
     for thread in threads:
         thread.join()
 

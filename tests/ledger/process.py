@@ -73,7 +73,7 @@ class Process:
             observers=observers,
             on_death=on_death,
         )
-        self.deconfliction = Deconfliction(self.writer, self.ledger, self.planner, performances, HORIZON_MS)
+        self.deconfliction = Deconfliction(self.writer, self.ledger, self.planner, performances, HORIZON_MS, 5_000)
         self.writer.start()
 
     def __enter__(self) -> Self:
