@@ -26,8 +26,6 @@ router = APIRouter(prefix="/v1/airspace", tags=["airspace"])
 
 # How often a stream looks whether the monitor has looked, and for how long it says nothing.
 _POLL_S, _SILENCE_S = 0.1, 10.0
-# Of the journal at once.
-_ENTRIES = 2_000
 _CONFORMANCE = frozenset(Conformance)
 
 
@@ -70,9 +68,10 @@ class _Bulletin:
 
 
 class Board:
-    """The newest bulletin, rendered once for all who watch."""
+    """The newest bulletin, rendered once for all who watch; of the journal each is sent so many entries at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, entries_at_once: int = 2_000) -> None:
+        self.entries_at_once = entries_at_once
         self._lock = threading.Lock()
         self._latest: _Bulletin | None = None
 
@@ -110,11 +109,11 @@ class _Watcher:
         removed = ledger.removed().journal_through
         if self.revision < removed:
             events.append(_event("gap", {"removed_through": removed}))
-        entries = ledger.journal_after(self.revision, _ENTRIES)
+        entries = ledger.journal_after(self.revision, self.board.entries_at_once)
         events += [_journal_event(entry) for entry in entries]
         if entries:
             self.revision = entries[-1].revision
-        self.is_behind = len(entries) == _ENTRIES
+        self.is_behind = len(entries) == self.board.entries_at_once
         return b"".join(events)
 
 

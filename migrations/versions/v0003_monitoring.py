@@ -19,9 +19,7 @@ def upgrade() -> None:
         "flight_intents_open", "flight_intents", ["arrival"], sqlite_where=sa.text(OPEN), postgresql_where=sa.text(OPEN)
     )
     # Positions taken before this time (ms) may have been removed.
-    op.add_column(
-        "counters", sa.Column("positions_removed_before", sa.BigInteger, nullable=False, server_default="0")
-    )
+    op.add_column("counters", sa.Column("positions_removed_before", sa.BigInteger, nullable=False, server_default="0"))
     # An entry of a track has intent 0 and no flight intent's id.
     op.add_column("journal", sa.Column("track_id", sa.Text))
     op.add_column("journal", sa.Column("reasons", sa.Text))

@@ -85,7 +85,7 @@ class Stream:
 
 
 @contextmanager
-def streaming(client: Client, headers: dict[str, str] | None = None) -> Iterator[Stream]:
+def streaming(client: Client, headers: dict[str, str] | None = None, board: Board | None = None) -> Iterator[Stream]:
     """Watch the airspace of a running service, and go away at the end."""
     # Another application on the same service: httpx would wait for the end of the answer.
     app = create_app(client.service.settings, client.service.clock, running=client.service)
@@ -96,7 +96,8 @@ def streaming(client: Client, headers: dict[str, str] | None = None) -> Iterator
     scope = {
         "type": "http", "asgi": {"version": "3.0", "spec_version": "2.0"}, "http_version": "1.1", "method": "GET",
         "scheme": "http", "path": STREAM, "raw_path": STREAM.encode(), "query_string": b"", "headers": fields,
-        "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 50_000), "state": {"service": client.service, "board": Board()},
+        "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 50_000),
+        "state": {"service": client.service, "board": board or Board()},
     }  # fmt: skip
 
     async def receive() -> Message:

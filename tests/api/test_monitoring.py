@@ -792,6 +792,21 @@ def test_two_monitors_that_look_at_once_record_each_change_once(
         assert [kind for kind, whose, _ in told(lanes) if whose == unseen] == ["accepted", "ended"]
 
 
+@on_sqlite
+def test_what_is_seen_is_shown_although_it_cannot_be_recorded_yet(
+    lanes: Client, on_lanes: Settings, clock: FakeClock
+) -> None:
+    monitor = lanes.service.monitor
+    see(lanes, "radar-1", 3.5, 1.5)
+    with write_lock(on_lanes.ledger):
+        first = monitor.look(patience_s=0.0)
+        clock.advance(seconds=1)
+        second = monitor.look(patience_s=0.0)
+        assert (monitor.latest, second.at_ms - first.at_ms) == (second, 1000)
+    look(lanes)
+    assert told(lanes) == [("deviating", "radar-1", ["no_flight_intent"])]
+
+
 @pytest.mark.parametrize(("action", "state"), [("activate", "activated"), ("end", "ended")])
 def test_a_change_that_an_operator_made_meanwhile_is_not_undone(
     lanes: Client, on_lanes: Settings, clock: FakeClock, action: str, state: str

@@ -12,6 +12,7 @@ from sqlalchemy import Engine, event
 from sqlalchemy.exc import OperationalError
 
 from app.main import create_app
+from app.routes.stream import Board
 from app.times import format_time
 from tests.api.bodies import SUBMIT, TELEMETRY, position, problem, report
 from tests.api.serving import Client, served, settings_for
@@ -19,7 +20,7 @@ from tests.api.streaming import STREAM, Event, streaming
 from tests.api.test_monitoring import ALERTS, FLIGHTS, STATUS, activated, fly, look, see, submit
 from tests.api.test_telemetry import failing
 from tests.ledger.district import DEPARTURE_MS, LANES
-from tests.ledger.locations import Ledgers, SqliteLedgers
+from tests.ledger.locations import Ledgers, SqliteLedgers, on_sqlite
 from tests.ledger.process import DAY_MS, FakeClock, until
 
 
@@ -255,3 +256,21 @@ def test_it_ends_when_the_server_does(lanes: Client) -> None:
         stream.news()
         lanes.service.closing.set()
         assert stream.has_ended()
+
+
+@on_sqlite
+def test_what_many_watch_is_rendered_once(lanes: Client) -> None:
+    board, monitor = Board(), lanes.service.monitor
+    view = monitor.look()
+    assert board.bulletin(lanes.service, view) is board.bulletin(lanes.service, view)
+    assert board.bulletin(lanes.service, monitor.look()).before is view
+
+
+@on_sqlite
+def test_a_long_journal_goes_out_in_parts_and_the_blocks_need_not_wait_for_it(lanes: Client) -> None:
+    for _ in range(5):
+        submit(lanes)
+    look(lanes)
+    with streaming(lanes, {"last-event-id": "0"}, Board(entries_at_once=2)) as stream:
+        found = [stream.next().name for _ in range(8)]
+    assert found == ["intent", "intent", "status", "flights", "alerts", "intent", "intent", "intent"]

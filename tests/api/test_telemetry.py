@@ -1,7 +1,9 @@
 """Telemetry over HTTP: what is taken, what is refused and why, and that a report may be repeated."""
 
+import asyncio
 import json
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,8 +20,8 @@ from tests.api.bodies import SUBMIT, TELEMETRY, intent, position, problem, repor
 from tests.api.serving import Client, served
 from tests.api.test_running import settings_with
 from tests.ledger.district import DEPARTURE_MS, OLD_TOWN, START_MS
-from tests.ledger.locations import database, on_sqlite
-from tests.ledger.process import FakeClock
+from tests.ledger.locations import database, on_sqlite, write_lock
+from tests.ledger.process import FakeClock, until
 
 NOBODY = "01a2025d-cf8d-7793-bfd6-fd7be76cdfea"
 HOUR_MS = 3_600_000
@@ -334,6 +336,25 @@ def test_two_positions_make_a_velocity(client: Client) -> None:
     velocity = tracks(client)["radar-1"]["velocity_mps"]
     # The grid's east lies two degrees off true east.
     assert velocity == pytest.approx({"east": 10.0, "north": 0.0, "up": -3.0}, abs=0.5)
+
+
+@on_sqlite
+def test_positions_too_near_in_time_change_no_velocity_and_are_no_jump(client: Client) -> None:
+    send(client, seen(START_MS - 1000, OLD_TOWN.point(1, 3)), seen(START_MS - 499, OLD_TOWN.point(1.25, 3)))
+    before = tracks(client)["radar-1"]["velocity_mps"]
+    answer = send(client, seen(START_MS, OLD_TOWN.point(3.25, 3)))
+    assert (answer["flagged"], before) == ([], tracks(client)["radar-1"]["velocity_mps"])
+
+
+@on_sqlite
+def test_reads_are_answered_while_a_great_many_reports_wait(client: Client, settings: Settings) -> None:
+    # More than there are threads for what blocks.
+    with ThreadPoolExecutor(60) as reporters:
+        with write_lock(settings.ledger):
+            sent = [reporters.submit(send, client, seen(track_id=f"radar-{number}")) for number in range(60)]
+            asyncio.run(until(lambda: client.service.writer.waiting >= 59))
+            assert client.get("/v1/airspace/status").json()["blocks"] == []
+        assert [answer.result()["accepted"] for answer in sent] == [1] * 60
 
 
 @on_sqlite

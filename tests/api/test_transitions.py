@@ -324,6 +324,28 @@ def test_a_flight_that_still_stands_on_its_pad_when_it_should_fly_gives_up_what_
 
 
 @on_sqlite
+def test_a_flight_that_stood_on_its_pad_a_while_ago_may_be_in_the_air_and_keeps_what_it_holds(
+    street: Client, clock: FakeClock
+) -> None:
+    flight = submit(street)
+    clock.now_ms = DEPARTURE_MS + 300
+    see(street, flight["id"], clock.now_ms, airborne=False)
+    clock.advance(ms=5_001)
+    assert attempt(street, flight["id"], "end").json()["reservations"] == flight["reservations"]
+
+
+@on_sqlite
+@pytest.mark.parametrize("action", ["end", "cancel"])
+def test_a_flight_that_took_off_before_its_departure_keeps_what_it_holds(
+    street: Client, clock: FakeClock, action: str
+) -> None:
+    flight = submit(street)
+    clock.now_ms = DEPARTURE_MS - 2_000
+    see(street, flight["id"], clock.now_ms, (1, 0, 0))
+    assert attempt(street, flight["id"], action).json()["reservations"] == flight["reservations"]
+
+
+@on_sqlite
 def test_after_its_arrival_ending_a_flight_takes_nothing_away(street: Client, clock: FakeClock) -> None:
     flight = submit(street)
     clock.now_ms = ARRIVAL_MS + 1
