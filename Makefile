@@ -5,7 +5,7 @@ INSTALLED := $(VENV)/.installed
 PEERS := $(VENV)/.peers
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve demo test bench faults soak lint lock openapi
+.PHONY: help install serve demo test bench faults soak screenshots lint lock openapi
 
 help:  ## Show these targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -41,6 +41,9 @@ faults: $(INSTALLED)  ## Break the service in every way we know; choose with PAR
 
 soak: $(INSTALLED)  ## A day of traffic in five minutes; choose with SECONDS=600
 	$(BIN)/python -m tests.soak.soak $(SECONDS)
+
+screenshots: $(INSTALLED)  ## Renew the README's pictures of the console (needs chromium)
+	AIRMATRIX_SCREENSHOTS=1 $(BIN)/pytest -q tests/console/test_screenshots.py
 
 lint: $(INSTALLED)  ## Check style, types, layers and the container files
 	$(BIN)/ruff check
