@@ -159,7 +159,9 @@ async def watch(
     revision = await to_thread.run_sync(service.ledger.revision)
     after = revision if last_event_id is None else min(last_event_id, revision)
     return StreamingResponse(
-        _events(service, board, after), media_type="text/event-stream", headers={"Cache-Control": "no-cache"}
+        _events(service, board, after),
+        media_type="text/event-stream",
+        headers={"Cache-Control": "no-cache", "X-Accel-Buffering": "no"},
     )
 
 
