@@ -156,11 +156,10 @@ class Monitor:
         began = time.perf_counter()
         view = self.view()
         try:
-            if self._writing is not None and not any(not future.done() for future in self._pending):
+            if self._writing is not None and not wait(self._pending, patience_s).not_done:
                 self._pending = []
                 self._record(view, *self._writing)
-                done, _ = wait(self._pending, patience_s)
-                for future in done:
+                for future in wait(self._pending, patience_s).done:
                     future.result()
         finally:
             self._latest = view
