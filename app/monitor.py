@@ -29,6 +29,8 @@ _SEVERE = frozenset({Conformance.LOST.value, Conformance.VIOLATING.value})
 # So many changes are recorded at once, and so many flights ended that were never seen: nobody waits long for that. So
 # often in one look.
 _PART, _END_AT_ONCE, _ENDS = 64, 256, 8
+# After its start a process that finds aircraft gives them so long to report again.
+_SETTLE_S = 5.0
 # The writer takes a few milliseconds for all that, unless it waits for others or for the ledger.
 _PATIENCE_S = 0.5
 # A flight is shown from so long before its departure, a track until so long after it was last seen.
@@ -167,11 +169,14 @@ class Monitor:
         return view
 
     def _run(self, every_s: float) -> None:
-        settled_s = time.monotonic() + self._thresholds.freshness_ms / 1000
+        settled_s: float | None = None
         while not self._stopping.wait(every_s):
             try:
-                if time.monotonic() < settled_s:
-                    # Nobody could report while nobody listened: that somebody is lost cannot be said yet.
+                if settled_s is None:
+                    # Nobody could report while nobody listened: that somebody is lost cannot be said at once.
+                    self._latest = self.view()
+                    settled_s = time.monotonic() + (_SETTLE_S if self._latest.picture.sightings else 0.0)
+                elif time.monotonic() < settled_s:
                     self._latest = self.view()
                 else:
                     self.look(_PATIENCE_S)
