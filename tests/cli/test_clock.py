@@ -13,6 +13,8 @@ from app.times import now_ms, parse_time
 from tests.cli.serving import Server, serving
 from tests.cli.town import along_row
 
+pytestmark = pytest.mark.compiled
+
 START = "2026-12-01T08:00:00Z"
 START_MS = parse_time(START)
 DAY_MS = 86_400_000

@@ -16,6 +16,8 @@ import pytest
 from app.client import Client
 from tests.cli.serving import AIRMATRIX, environment
 
+pytestmark = pytest.mark.compiled
+
 PATIENCE_S = 90.0
 
 

@@ -24,6 +24,8 @@ from tests.cli.conftest import Run, numbers
 from tests.cli.serving import AIRMATRIX, Server, environment, serving
 from tests.cli.town import along_row
 
+pytestmark = pytest.mark.compiled
+
 # Seconds of the service's clock a second: its freshness of 5 s is a whole second here.
 RATE = 5
 # With it, each of the first six flights deviates in another way: these, by sequence number.

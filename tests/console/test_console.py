@@ -9,6 +9,8 @@ from app.times import format_time
 from tests.console.browser import Watched, yellow
 from tests.console.quarter import ATTRIBUTION, Quarter
 
+pytestmark = pytest.mark.compiled
+
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 

@@ -3,8 +3,12 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.console.browser import PATIENCE_MS, Watched, vermilion, yellow
 from tests.console.quarter import SLOW, quarter
+
+pytestmark = pytest.mark.compiled
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -7,6 +7,8 @@ import pytest
 from tests.console.browser import Watched
 from tests.console.quarter import GRID, Quarter, place
 
+pytestmark = pytest.mark.compiled
+
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 1000])
 def test_events_are_read_however_the_stream_is_cut(modules: Watched, size: int) -> None:

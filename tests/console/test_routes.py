@@ -4,6 +4,8 @@ import pytest
 
 from tests.api.serving import Client
 
+pytestmark = pytest.mark.compiled
+
 _VENDOR = "/console/vendor/maplibre-gl.js"
 
 

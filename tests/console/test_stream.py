@@ -4,9 +4,13 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.cli.serving import started
 from tests.console.browser import PATIENCE_MS, Watched
 from tests.console.quarter import quarter
+
+pytestmark = pytest.mark.compiled
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
