@@ -17,8 +17,8 @@ from app.times import format_time
 from tests.api.bodies import SUBMIT, TELEMETRY, position, problem, report
 from tests.api.serving import Client, served, settings_for
 from tests.api.streaming import STREAM, Event, streaming
-from tests.api.test_monitoring import ALERTS, FLIGHTS, STATUS, activated, fly, look, see, submit
 from tests.api.test_telemetry import failing
+from tests.api.watching import ALERTS, FLIGHTS, STATUS, activated, fly, look, see, submit
 from tests.ledger.district import DEPARTURE_MS, LANES
 from tests.ledger.locations import Ledgers, SqliteLedgers, on_sqlite
 from tests.ledger.process import DAY_MS, FakeClock, until
@@ -215,16 +215,20 @@ def test_it_cannot_begin_without_the_ledger(lanes: Client) -> None:
 
 
 @contextmanager
-def unreadable_to_streams(statement: str) -> Iterator[None]:
-    """Fail the statements that begin like this in the threads in which streams read."""
+def unreadable_to_streams(statement: str, *, after: int = 0) -> Iterator[list[str]]:
+    """Fail the statements that begin like this, after some, in the threads in which streams read; yield all of them."""
+    seen: list[str] = []
 
     def listener(_connection: object, _cursor: object, text: str, *_: object) -> None:
         if text.startswith(statement) and threading.current_thread().name == "AnyIO worker thread":
+            seen.append(text)
+            if len(seen) <= after:
+                return
             raise OperationalError(text, {}, Exception("disk I/O error"))
 
     event.listen(Engine, "before_cursor_execute", listener)
     try:
-        yield
+        yield seen
     finally:
         event.remove(Engine, "before_cursor_execute", listener)
 
@@ -249,6 +253,19 @@ def test_what_a_failing_ledger_kept_back_comes_with_the_next_look(
     assert [each.id for each in news if each.id is not None] == [1, 2, 3, 4]
     assert blocks(of("status", news)) == blocks(lanes.get(STATUS).json()) != []
     assert [item["flight_intent_id"] for item in of("alerts", news)["items"]] == [flight]
+
+
+@on_sqlite
+def test_who_is_behind_in_the_journal_does_not_press_a_failing_ledger(lanes: Client) -> None:
+    for _ in range(3):
+        submit(lanes)
+    look(lanes)
+    failing_soon = unreadable_to_streams("SELECT journal", after=1)
+    with failing_soon as asked, streaming(lanes, {"last-event-id": "0"}, Board(entries_at_once=1)) as stream:
+        assert [stream.next().name for _ in range(4)] == ["intent", "status", "flights", "alerts"]
+        assert stream.next().comment == "the ledger cannot be read: disk I/O error"
+        assert stream.is_quiet(0.3)
+        assert len(asked) == 2
 
 
 def test_it_ends_when_the_server_does(lanes: Client) -> None:
