@@ -26,6 +26,8 @@ router = APIRouter(prefix="/v1/airspace", tags=["airspace"])
 
 # How often a stream looks whether the monitor has looked, and for how long it says nothing.
 _POLL_S, _SILENCE_S = 0.1, 10.0
+# How long it leaves a ledger alone that has failed.
+_RETRY_S = 1.0
 _CONFORMANCE = frozenset(Conformance)
 
 
@@ -183,8 +185,10 @@ async def _events(service: Service, board: Board, revision: int) -> AsyncIterato
         after = replace(watcher)
         try:
             content = await to_thread.run_sync(after.news, view)
-            watcher = after
         except LedgerUnavailable as error:
-            # Nothing of it was told; the next look tells it all.
-            content = format_sse_event(comment=str(error))
+            # Nothing of it was told. Who is behind in the journal asks again, but not at once.
+            yield format_sse_event(comment=str(error))
+            await asyncio.sleep(_RETRY_S)
+            continue
+        watcher = after
         yield content
