@@ -20,18 +20,20 @@ from planner.errors import (
     OriginBlocked,
     SameBlock,
 )
+from planner.holds import holds_of
 from planner.kernels import labels as label_columns
 from planner.kernels import path as path_kernels
 from planner.kernels import search as search_kernels
 from planner.kernels.balancing import least_cost
 from planner.kernels.connectivity import label_components
 from planner.kernels.endurance import within_endurance
+from planner.kernels.intervals import FAR_FUTURE
 from planner.kernels.labels import LAST_STAMP, Task, larger_workspace, new_workspace
 from planner.kernels.motion import VISITS, Motion
 from planner.kernels.static_search import UNREACHED, Bounds, static_search
 from planner.links import LinkTimes, build_link_times, build_offsets
 from planner.occupancy import OccupancyIndex, build_motion, open_links
-from planner.path import Plan
+from planner.path import Plan, Trajectory
 
 # How far beyond the requested window a refusal looks for a departure that would work; within what keys can order.
 _OUTLOOK_MS = 1 << 31
@@ -68,7 +70,8 @@ class PlanRequest:
     """From block to block (flat indices) with a departure in [earliest, latest], in ms.
 
     `layer_surcharge_ms` (layers,): what each link that ends in a layer counts beyond the time it takes, so that flights
-    prefer other layers; empty, the default, for nothing. Only the safe-interval search knows it.
+    prefer other layers; empty, the default, for nothing. Only the safe-interval search knows it. A flight that
+    `is_airborne` is in its first block already: it needs no climb-out there.
     """
 
     origin: int
@@ -77,6 +80,7 @@ class PlanRequest:
     earliest_departure_ms: int
     latest_departure_ms: int
     layer_surcharge_ms: tuple[int, ...] = ()
+    is_airborne: bool = False
 
     def __post_init__(self) -> None:
         if self.latest_departure_ms < self.earliest_departure_ms:
@@ -86,7 +90,7 @@ class PlanRequest:
 
 
 class Planner:
-    """CFA* over one airspace and the reservations in `index`. One thread at a time."""
+    """CFA* over one airspace and the reservations in `index`, or in another one. One thread at a time."""
 
     def __init__(self, airspace: Airspace, search: Search = Search.SAFE_INTERVAL, hover_limit_ms: int = 60_000) -> None:
         self.airspace = airspace
@@ -101,8 +105,10 @@ class Planner:
         self._stamp = self._static_stamp = 0
         self._motions: dict[tuple[int, ...], Motion] = {}
 
-    def plan(self, request: PlanRequest) -> Plan:
+    def plan(self, request: PlanRequest, index: OccupancyIndex | None = None) -> Plan:
         """Return a conflict-free plan; with the safe-interval search the one of earliest arrival.
+
+        It is free of conflicts with what `index` holds: the planner's own by default.
 
         Raises
         ------
@@ -119,10 +125,12 @@ class Planner:
         self.check(request.origin, request.destination)
         motion = self._motion(request.performance)
         bounds = self._bounds(motion, request.origin, request.destination)
-        found = self._search(request, motion, bounds)
+        index = self.index if index is None else index
+        found = self._search(request, motion, bounds, index)
         if isinstance(found, Plan):
             return found
-        found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request, motion, bounds)
+        if not request.is_airborne:
+            found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request, motion, bounds, index)
         raise found
 
     def unconstrained(self, request: PlanRequest) -> int:
@@ -130,6 +138,42 @@ class Planner:
         self.check(request.origin, request.destination)
         bounds = self._bounds(self._motion(request.performance), request.origin, request.destination)
         return int(bounds.optimum) + 2 * self.airspace.terminal_dwell_ms
+
+    def continued(self, flown: Trajectory, request: PlanRequest, index: OccupancyIndex | None = None) -> Plan:
+        """Return the plan of a flight in the air: as it has `flown` until it reaches the origin of `request`, and from
+        there as `plan` finds it.
+
+        The request begins where `flown` ends and has one departure, that flight's last arrival or later. The holds are
+        those of the whole; endurance counts from the first departure.
+
+        Raises
+        ------
+        NotPlannable, NoPlan
+            As `plan`.
+        """
+        performance = request.performance
+        if performance.endurance_ms is not None:
+            so_far = request.earliest_departure_ms - flown.departure_ms
+            performance = replace(performance, endurance_ms=performance.endurance_ms - so_far)
+        rest = self.plan(replace(request, performance=performance, is_airborne=True), index)
+        block = np.concatenate([flown.block, rest.block[1:]])
+        arrive = np.concatenate([flown.arrive_ms, rest.arrive_ms[1:]])
+        depart = np.concatenate([flown.depart_ms[:-1], rest.depart_ms])
+        links = arrive[1 : len(flown.block)] - depart[: len(flown.block) - 1]
+        hold_block, hold_enter, hold_exit = holds_of(self.airspace, block, arrive, depart)
+        return replace(
+            rest,
+            block=block,
+            arrive_ms=arrive,
+            depart_ms=depart,
+            hold_block=hold_block,
+            hold_enter_ms=hold_enter,
+            hold_exit_ms=hold_exit,
+            earliest_departure_ms=flown.departure_ms,
+            slot_opens_ms=flown.departure_ms,
+            # What was flown would have taken as long without traffic, but for hovering.
+            unconstrained_ms=int(links.sum()) + self.airspace.terminal_dwell_ms + rest.unconstrained_ms,
+        )
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to these blocks, if any."""
@@ -154,58 +198,62 @@ class Planner:
                 return bounds
             self._workspace = larger_workspace(self._workspace)
 
-    def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds) -> Plan | NoPlan:
+    def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex) -> Plan | NoPlan:
         """Search and return the plan, or the error that says why there is none."""
         task = Task(
             request.origin,
             request.destination,
             request.earliest_departure_ms,
             request.latest_departure_ms,
+            0 if request.is_airborne else self.airspace.terminal_dwell_ms,
             self.airspace.terminal_dwell_ms,
             self.hover_limit_ms,
             stamp=0,
         )
         if self.search is Search.GREEDY:
-            status, label, further = self._run(search_kernels.greedy, motion, task)
+            status, label, further = self._run(search_kernels.greedy, motion, index, task)
         elif request.layer_surcharge_ms:
             surcharge = np.array(request.layer_surcharge_ms, dtype=np.int64)
-            status, label, further = self._run(least_cost, motion, task, bounds, surcharge)
+            status, label, further = self._run(least_cost, motion, index, task, bounds, surcharge)
         else:
-            status, label, further = self._run(search_kernels.safe_interval, motion, task, bounds)
+            status, label, further = self._run(search_kernels.safe_interval, motion, index, task, bounds)
         expansions = bounds.expansions + further
         visits = int(self._workspace.around[VISITS])
         if status == search_kernels.NO_DEPARTURE_SLOT:
-            owners = self.index.owners(task.origin, task.earliest, task.latest + task.dwell + 1)
+            owners = index.owners(task.origin, task.earliest, task.latest + task.climb_out + 1)
             return NoDepartureSlot(
                 "the first block is reserved throughout the departure window", owners, expansions=expansions
             )
         if status == search_kernels.NO_PATH:
             return NoConflictFreePath(
                 "no conflict-free path leads from the first block within the departure window",
-                self._owners_around(label),
+                # Who is shut out for good meets nobody on the way.
+                index.owners(task.destination, FAR_FUTURE - 1, FAR_FUTURE) or self._owners_around(index, label),
                 expansions=expansions,
             )
-        plan = self._plan(motion, task, bounds, label, expansions, visits)
+        plan = self._plan(motion, index, task, bounds, label, expansions, visits)
         endurance = request.performance.endurance_ms
         if endurance is None or plan.flight_time_ms <= endurance:
             return plan
         if self.search is Search.SAFE_INTERVAL:
-            status, label, further = self._run(within_endurance, motion, task, bounds, endurance)
+            status, label, further = self._run(within_endurance, motion, index, task, bounds, endurance)
             expansions += further
             visits += int(self._workspace.around[VISITS])
             if status == search_kernels.FOUND:
-                return self._plan(motion, task, bounds, label, expansions, visits)
+                return self._plan(motion, index, task, bounds, label, expansions, visits)
         return EnduranceExceeded(
             f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s",
             expansions=expansions,
         )
 
-    def _earliest_feasible_departure(self, request: PlanRequest, motion: Motion, bounds: Bounds) -> int | None:
+    def _earliest_feasible_departure(
+        self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex
+    ) -> int | None:
         """Return the earliest departure after the request's window from which there is a plan, None if none is near."""
         earliest = None
         latest = request.latest_departure_ms + _OUTLOOK_MS
         while latest > request.latest_departure_ms:
-            later = self._search(replace(request, latest_departure_ms=latest), motion, bounds)
+            later = self._search(replace(request, latest_departure_ms=latest), motion, bounds, index)
             if isinstance(later, NoPlan):
                 break
             # Who departs as soon as the first block is free may have to hover, which an endurance may not allow.
@@ -214,7 +262,7 @@ class Planner:
             latest = later.slot_opens_ms - 1
         return earliest
 
-    def _owners_around(self, labels: int) -> tuple[int, ...]:
+    def _owners_around(self, index: OccupancyIndex, labels: int) -> tuple[int, ...]:
         """Return the owners of the reservations that shut in a search without a path, in the order it met them."""
         owners: dict[int, None] = {}
         for label in self._workspace.labels[: min(labels, _SHUT_IN_LABELS)]:
@@ -222,7 +270,7 @@ class Planner:
             near = [block, *(block + offset for link, offset in enumerate(self._offsets) if open_links >> link & 1)]
             for place in near:
                 owners.update(
-                    dict.fromkeys(self.index.owners(place, label[label_columns.G], label[label_columns.GAP_END] + 1))
+                    dict.fromkeys(index.owners(place, label[label_columns.G], label[label_columns.GAP_END] + 1))
                 )
         return tuple(owners)
 
@@ -230,13 +278,14 @@ class Planner:
         self,
         kernel: Callable[..., tuple[int, int, int]],
         motion: Motion,
+        index: OccupancyIndex,
         task: Task,
         *rest: Bounds | IntArray | int,
     ) -> tuple[int, int, int]:
         """Run a search kernel, with a larger workspace as often as it asks for one."""
         while True:
             stamped = task._replace(stamp=self._next_stamp())
-            outcome = kernel(self._open_links, motion, self.index.slabs, self._workspace, stamped, *rest)
+            outcome = kernel(self._open_links, motion, index.slabs, self._workspace, stamped, *rest)
             if outcome[0] != search_kernels.WORKSPACE_FULL:
                 return outcome
             self._workspace = larger_workspace(self._workspace)
@@ -256,13 +305,22 @@ class Planner:
         self._static_stamp += 1
         return self._static_stamp
 
-    def _plan(self, motion: Motion, task: Task, bounds: Bounds, goal: int, expansions: int, visits: int) -> Plan:
+    def _plan(
+        self,
+        motion: Motion,
+        index: OccupancyIndex,
+        task: Task,
+        bounds: Bounds,
+        goal: int,
+        expansions: int,
+        visits: int,
+    ) -> Plan:
         """Turn the labels of a finished search into a plan."""
         ws = self._workspace
         block, arrive, depart, gap_end = path_kernels.trace(ws.labels, goal, task)
         slot_opens_ms = int(arrive[0])
         if self.search is Search.SAFE_INTERVAL:
-            path_kernels.wait_early(motion, self.index.slabs, block, arrive, depart, gap_end)
+            path_kernels.wait_early(motion, index.slabs, block, arrive, depart, gap_end)
         path_kernels.hold_on_ground(arrive, depart, task)
         hold_block, hold_enter, hold_exit = path_kernels.holds(
             motion, ws.marks, self._next_stamp(), block, arrive, depart
@@ -277,7 +335,7 @@ class Planner:
             earliest_departure_ms=task.earliest,
             slot_opens_ms=slot_opens_ms,
             # Without the JIT kernels return numpy's integers.
-            unconstrained_ms=int(bounds.optimum) + 2 * task.dwell,
+            unconstrained_ms=int(bounds.optimum) + task.climb_out + task.dwell,
             terminal_dwell_ms=task.dwell,
             expansions=expansions,
             static_expansions=bounds.expansions,

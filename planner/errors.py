@@ -4,16 +4,28 @@ PlannerError
 ├── BuildingDataError         footprints or heights that cannot be used
 ├── AirspaceFileError         not an airspace file, or a damaged one
 ├── AircraftProfileError      an aircraft profile the speed model or the heuristic cannot accept
+├── VolumeError               a polygon with altitudes that takes no blocks
 ├── NotPlannable              static: a property of the request; no traffic can change it
 │   ├── OutsideAirspace       outside_airspace
 │   ├── OriginBlocked         origin_blocked
 │   ├── DestinationBlocked    destination_blocked
 │   ├── SameBlock             same_block
 │   └── Disconnected          disconnected
+├── PathRefused               static too: an operator's own path that cannot be flown
+│   ├── EntryOutside          outside_airspace
+│   ├── OutOfOrder            out_of_order
+│   ├── NotAChain             not_a_chain
+│   ├── TooFast               too_fast
+│   ├── InBuilding            in_building
+│   ├── DwellTooShort         dwell_too_short
+│   ├── TooLong               too_long
+│   ├── BeyondEndurance       endurance_exceeded
+│   └── NotFlyable            not_flyable
 └── NoPlan                    dynamic: a property of the traffic at that moment
     ├── NoDepartureSlot       no_departure_slot
     ├── NoConflictFreePath    no_conflict_free_path
-    └── EnduranceExceeded     endurance_exceeded
+    ├── EnduranceExceeded     endurance_exceeded
+    └── PathConflicts         path_conflicts (in `planner.submitted`)
 """
 
 from typing import ClassVar
@@ -35,6 +47,10 @@ class AirspaceFileError(PlannerError):
 
 class AircraftProfileError(PlannerError):
     """An aircraft profile is malformed or outside what the speed model covers."""
+
+
+class VolumeError(PlannerError):
+    """A polygon is malformed or invalid, or lies outside the AirMatrix with its altitudes."""
 
 
 class NotPlannable(PlannerError):
@@ -77,6 +93,73 @@ class Disconnected(NotPlannable):
     """Buildings leave no chain of links from origin to destination."""
 
     reason = "disconnected"
+
+
+class PathRefused(PlannerError):
+    """An operator's own path cannot be flown whatever the traffic.
+
+    `entry` is the index of the first entry that shows it, None where no single one does.
+    """
+
+    reason: ClassVar[str]
+
+    def __init__(self, message: str, entry: int | None = None) -> None:
+        super().__init__(message if entry is None else f"entry {entry}: {message}")
+        self.entry = entry
+
+
+class EntryOutside(PathRefused):
+    """A block lies outside the AirMatrix."""
+
+    reason = "outside_airspace"
+
+
+class OutOfOrder(PathRefused):
+    """An entry ends before it begins, or begins before the one ahead of it has ended."""
+
+    reason = "out_of_order"
+
+
+class NotAChain(PathRefused):
+    """A block is no neighbour of the one before."""
+
+    reason = "not_a_chain"
+
+
+class TooFast(PathRefused):
+    """A link takes less time than the aircraft is planned with."""
+
+    reason = "too_fast"
+
+
+class InBuilding(PathRefused):
+    """A block that the flight must hold is statically occupied."""
+
+    reason = "in_building"
+
+
+class DwellTooShort(PathRefused):
+    """The stay in the first or the last block is shorter than the airspace's terminal dwell."""
+
+    reason = "dwell_too_short"
+
+
+class TooLong(PathRefused):
+    """From the first hold to the last lies more time than a submitted path may take."""
+
+    reason = "too_long"
+
+
+class BeyondEndurance(PathRefused):
+    """The path takes longer than the aircraft can stay in the air."""
+
+    reason = "endurance_exceeded"
+
+
+class NotFlyable(PathRefused):
+    """The aircraft has no way through the volumes."""
+
+    reason = "not_flyable"
 
 
 class NoPlan(PlannerError):

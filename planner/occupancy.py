@@ -1,5 +1,9 @@
 """Who holds which block when: the rules' geometry and the index of committed reservations (paper 2.1, 2.4)."""
 
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from typing import NamedTuple
+
 import numpy as np
 
 from planner.airmatrix import Int32Array, IntArray
@@ -14,21 +18,42 @@ from planner.links import DIRECTIONS, LINK_COUNT, LinkTimes, box_steps, build_of
 _LINK_OF = {direction: link for link, direction in enumerate(DIRECTIONS)}
 
 
+class Closure(NamedTuple):
+    """Blocks that nobody may enter in [enter, exit): (n,) each, int64 and ms."""
+
+    block: IntArray
+    enter_ms: IntArray
+    exit_ms: IntArray
+
+    @classmethod
+    def of(cls, blocks: IntArray, from_ms: int, until_ms: int | None) -> "Closure":
+        """Return what closes all of some blocks within [from, until), or for good."""
+        until_ms = intervals.FAR_FUTURE if until_ms is None else until_ms
+        return cls(blocks, np.full_like(blocks, from_ms), np.full_like(blocks, until_ms))
+
+
 class OccupancyIndex:
     """The committed reservations of an airspace, per block and sorted: a cache of the ledger that kernels can read.
 
-    Not for several threads at once: a kernel that reads it runs without the GIL.
+    Closures lie around the reservations: a flight that was there first keeps what it holds of them. Not for several
+    threads at once: a kernel that reads it runs without the GIL.
     """
 
     def __init__(self, block_count: int) -> None:
         self.slabs = intervals.empty_slabs(block_count, pool_size=1 << 12)
         self._size = 0
+        self._closures: dict[int, Closure] = {}
+        # Block, enter, exit and owner of each closure's blocks, by block and number.
+        self._closed_rows = np.empty((4, 0), dtype=np.int64)
+        self._is_closed = np.zeros(block_count, dtype=np.bool_)
 
     def __len__(self) -> int:
         return self._size
 
     def reserve(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray, owner: int | IntArray) -> None:
         """Add half-open reservations [enter, exit), disjoint among themselves, of one owner or one each: all or none.
+
+        They may lie in closures; who plans asks first.
 
         Raises
         ------
@@ -37,23 +62,64 @@ class OccupancyIndex:
         """
         if np.any(enters_ms >= exits_ms):
             raise ValueError("a reservation must end after it begins")
-        clash = intervals.first_overlap(self.slabs.table, self.slabs.pool, blocks, enters_ms, exits_ms)
-        if clash >= 0:
-            raise ValueError(f"block {blocks[clash]} is reserved within [{enters_ms[clash]}, {exits_ms[clash]})")
-        owners = np.broadcast_to(np.asarray(owner, dtype=np.int64), blocks.shape).copy()
-        done = 0
-        while (done := intervals.insert(*self.slabs, blocks, enters_ms, exits_ms, owners, done)) < len(blocks):
-            self._grow()
-        self._size += len(blocks)
+        with self._opened(blocks):
+            clash = intervals.first_overlap(self.slabs.table, self.slabs.pool, blocks, enters_ms, exits_ms)
+            if clash >= 0:
+                raise ValueError(f"block {blocks[clash]} is reserved within [{enters_ms[clash]}, {exits_ms[clash]})")
+            owners = np.broadcast_to(np.asarray(owner, dtype=np.int64), blocks.shape).copy()
+            self._insert(intervals.insert, blocks, enters_ms, exits_ms, owners)
+            self._size += len(blocks)
 
     def release(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray) -> int:
         """Remove exactly these reservations where they are present; return how many were."""
-        removed = int(intervals.remove(*self.slabs, blocks, enters_ms, exits_ms))
-        self._size -= removed
+        with self._opened(blocks):
+            removed = int(intervals.remove(*self.slabs, blocks, enters_ms, exits_ms))
+            self._size -= removed
         return removed
 
+    @property
+    def closed(self) -> frozenset[int]:
+        """The numbers under which something is closed."""
+        return frozenset(self._closures)
+
+    def close(self, closures: Mapping[int, Closure]) -> None:
+        """Close blocks under numbers above 0; the owner of what is closed is the negative number."""
+        self._closures.update(closures)
+        self._index_closures()
+        with self._opened(np.concatenate([closure.block for closure in closures.values()])):
+            pass
+
+    def reopen(self, numbers: Collection[int]) -> None:
+        """Take back what was closed under some numbers, where anything was."""
+        gone = [number for number in numbers if number in self._closures]
+        if gone:
+            with self._opened(np.concatenate([self._closures[number].block for number in gone])):
+                for number in gone:
+                    del self._closures[number]
+                self._index_closures()
+
+    def without(self, owners: IntArray) -> "OccupancyIndex":
+        """Return a copy without the reservations of some owners; closures reach where those were."""
+        copied = OccupancyIndex(0)
+        used = int(self.slabs.chains[-1])
+        copied.slabs = intervals.Slabs(
+            self.slabs.table.copy(),
+            np.concatenate([self.slabs.pool[:used], np.empty((max(used, 1 << 12), 3), dtype=np.int64)]),
+            self.slabs.chains.copy(),
+        )
+        copied._closures = dict(self._closures)
+        copied._closed_rows, copied._is_closed = self._closed_rows, self._is_closed
+        copied._size = self._size - int(intervals.drop_owners(*copied.slabs, np.unique(owners)))
+        copied._lay_closures(np.flatnonzero(self._is_closed))
+        return copied
+
+    def copy(self) -> "OccupancyIndex":
+        """Return an index with the same reservations and closures."""
+        return self.without(np.empty(0, dtype=np.int64))
+
     def forget_before(self, time_ms: int) -> int:
-        """Drop the reservations that end by `time_ms`; return how many."""
+        """Drop the reservations and closures that end by `time_ms`; return how many reservations."""
+        self.reopen([number for number, closure in self._closures.items() if np.all(closure.exit_ms <= time_ms)])
         dropped = int(intervals.forget(*self.slabs, time_ms))
         self._size -= dropped
         return dropped
@@ -62,16 +128,56 @@ class OccupancyIndex:
         """Drop everything."""
         self.slabs = intervals.empty_slabs(len(self.slabs.table), len(self.slabs.pool))
         self._size = 0
+        self._closures.clear()
+        self._index_closures()
 
     def owners(self, block: int, from_ms: int, to_ms: int) -> tuple[int, ...]:
-        """Return the owners of a block's reservations that overlap [from, to), in order of time, each once."""
-        first, count = self.slabs.table[block, : intervals.SIZE_CLASS]
-        held = self.slabs.pool[first : first + count] if count else self.slabs.pool[:0]
-        overlapping = (held[:, intervals.ENTER] < to_ms) & (held[:, intervals.EXIT] > from_ms)
-        return tuple(dict.fromkeys(int(owner) for owner in held[overlapping, intervals.OWNER]))
+        """Return the owners of what overlaps [from, to) in a block, in order of time, each once; a closure's is its
+        negative number.
+        """
+        return self.owners_within(*(np.array([value], dtype=np.int64) for value in (block, from_ms, to_ms)))
 
-    def _grow(self) -> None:
-        self.slabs = self.slabs._replace(pool=np.concatenate([self.slabs.pool, np.empty_like(self.slabs.pool)]))
+    def owners_within(self, blocks: IntArray, enters_ms: IntArray, exits_ms: IntArray) -> tuple[int, ...]:
+        """Return the owners of what overlaps half-open intervals of blocks, in their order, each once."""
+        found = intervals.owners_within(self.slabs.table, self.slabs.pool, blocks, enters_ms, exits_ms)
+        return tuple(dict.fromkeys(found.tolist()))
+
+    @contextmanager
+    def _opened(self, blocks: IntArray) -> Iterator[None]:
+        """Change the reservations of some blocks without the closures that lie around them."""
+        closed = np.unique(blocks[self._is_closed[blocks]])
+        if not len(closed):
+            yield
+            return
+        intervals.open_blocks(*self.slabs, closed)
+        try:
+            yield
+        finally:
+            self._lay_closures(closed)
+
+    def _index_closures(self) -> None:
+        """Make anew, for copies share them, what is looked up of closures by block."""
+        parts = [
+            np.stack([*closure, np.full_like(closure.block, -number)]) for number, closure in self._closures.items()
+        ]
+        rows = np.concatenate([np.empty((4, 0), dtype=np.int64), *parts], axis=1)
+        self._closed_rows = rows[:, np.lexsort((-rows[3], rows[0]))]
+        self._is_closed = np.zeros(len(self.slabs.table), dtype=np.bool_)
+        self._is_closed[rows[0]] = True
+
+    def _lay_closures(self, blocks: IntArray) -> None:
+        """Lay the closures around the reservations of some blocks (ascending), in the order of their numbers."""
+        first = np.searchsorted(self._closed_rows[0], blocks, side="left")
+        count = np.searchsorted(self._closed_rows[0], blocks, side="right") - first
+        # The rows first, first + 1, … of each block.
+        here = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+        self._insert(intervals.close_blocks, *self._closed_rows[:, here])
+
+    def _insert(self, kernel: Callable[..., int], *rows: IntArray) -> None:
+        """Run a kernel that adds rows, with a larger pool as often as it needs one."""
+        done = 0
+        while (done := kernel(*self.slabs, *rows, done)) < len(rows[0]):
+            self.slabs = self.slabs._replace(pool=np.concatenate([self.slabs.pool, np.empty_like(self.slabs.pool)]))
 
 
 def boxes(rule: OccupancyRule) -> list[list[Block]]:

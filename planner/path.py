@@ -1,6 +1,6 @@
 """A plan: the path of one flight in space and time, and the holds it asks for."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from planner.airmatrix import IntArray
 
@@ -10,7 +10,8 @@ class Trajectory:
     """A flight's path. Times are int64 ms, blocks flat indices.
 
     `block`, `arrive_ms`, `depart_ms` (n,): the chain of block centres; the first arrival is the departure, the last
-    departure the arrival, terminal dwell included. `unconstrained_ms` is the flight time without traffic.
+    departure the arrival, terminal dwell included. `unconstrained_ms` is the flight time without traffic. One that
+    `is_submitted` was made by the operator: its links may take longer than the aircraft is planned with.
     """
 
     block: IntArray
@@ -18,6 +19,7 @@ class Trajectory:
     depart_ms: IntArray
     unconstrained_ms: int
     terminal_dwell_ms: int
+    is_submitted: bool = field(default=False, kw_only=True)
 
     @property
     def departure_ms(self) -> int:

@@ -10,6 +10,7 @@ from planner.cfa_star import Performance, Planner, PlanRequest, Search
 from planner.errors import EnduranceExceeded
 from planner.kernels.policy import is_compiled as kernels_are_compiled
 from planner.links import LinkTimes
+from planner.occupancy import Closure
 
 __all__ = ["kernels_are_compiled", "warm_up"]
 
@@ -29,6 +30,8 @@ def warm_up() -> None:
         block, enter, leave = (np.array([value], dtype=np.int64) for value in (4, 0, 1))
         planner.index.reserve(block, enter, leave, owner=1)
         planner.index.release(block, enter, leave)
+        planner.index.close({1: Closure(block, enter, leave)})
+        planner.index.copy().owners(4, 0, 1)
         planner.index.forget_before(0)
         request = PlanRequest(0, grid.block_count - 1, performance, 0, 0, surcharge)
         with suppress(EnduranceExceeded):

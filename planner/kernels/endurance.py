@@ -88,8 +88,8 @@ def within_endurance(
         return WORKSPACE_FULL, -1, 0
     size = 0
     for label in range(count):
-        labels[label, DEPARTURE] = min(task.latest, labels[label, GAP_END] - 1 - task.dwell)
-        labels[label, FLOWN] = task.dwell
+        labels[label, DEPARTURE] = min(task.latest, labels[label, GAP_END] - 1 - task.climb_out)
+        labels[label, FLOWN] = task.climb_out
         size = open_label(heap, size, labels, label, labels[label, G] + h, task.earliest)
     expansions = 0
     while size > 0:

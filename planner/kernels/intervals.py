@@ -3,6 +3,9 @@
 A slab holds ``4 << size_class`` reservations. A block whose slab is full moves to one of the next class; freed slabs
 are chained through the first slot's enter. Free intervals ("gaps") are the spaces between
 reservations: gap g of a block lies before reservation g, so a block with c reservations has gaps 0 … c.
+
+What closes a block without being a flight's reservation has a negative owner: a part of a closure, laid around the
+reservations there. A closure without an end exits in the far future: nothing fits behind it.
 """
 
 from typing import NamedTuple
@@ -10,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from planner.airmatrix import Int32Array, IntArray
-from planner.kernels.policy import kernel
+from planner.kernels.policy import allocating_kernel, kernel
 
 FAR_FUTURE = 1 << 62
 
@@ -199,12 +202,111 @@ def remove(
 
 @kernel
 def forget(table: Int32Array, pool: IntArray, chains: IntArray, time: int) -> int:
-    """Drop every reservation that has ended by `time`; return how many."""
+    """Drop every reservation, and part of a closure, that has ended by `time`; return how many were reservations."""
     dropped = 0
     for block in range(table.shape[0]):
         if table[block, COUNT] > 0:
             ended = ended_by(table, pool, block, time)
             if ended > 0:
+                first = table[block, FIRST]
+                for slot in range(first, first + ended):
+                    dropped += pool[slot, OWNER] >= 0
                 drop_range(table, pool, chains, block, 0, ended)
-                dropped += ended
     return dropped
+
+
+@kernel
+def drop_owners(table: Int32Array, pool: IntArray, chains: IntArray, owners: IntArray) -> int:
+    """Drop every reservation of owners (sorted), and every part of a closure; return how many were reservations."""
+    dropped = 0
+    for block in range(table.shape[0]):
+        first, count = table[block, FIRST], table[block, COUNT]
+        kept = 0
+        for slot in range(first, first + count):
+            owner = pool[slot, OWNER]
+            low, high = 0, owners.shape[0]
+            while low < high:
+                middle = (low + high) >> 1
+                if owners[middle] < owner:
+                    low = middle + 1
+                else:
+                    high = middle
+            if owner >= 0 and (low == owners.shape[0] or owners[low] != owner):
+                move(pool, slot, first + kept)
+                kept += 1
+            else:
+                dropped += owner >= 0
+        if kept < count:
+            drop_range(table, pool, chains, block, kept, count)
+    return dropped
+
+
+@kernel
+def open_blocks(table: Int32Array, pool: IntArray, chains: IntArray, blocks: IntArray) -> None:
+    """Drop the parts of closures in some blocks."""
+    for n in range(blocks.shape[0]):
+        block = blocks[n]
+        for g in range(table[block, COUNT] - 1, -1, -1):
+            if pool[table[block, FIRST] + g, OWNER] < 0:
+                drop_range(table, pool, chains, block, g, g + 1)
+
+
+@kernel
+def close_blocks(
+    table: Int32Array,
+    pool: IntArray,
+    chains: IntArray,
+    blocks: IntArray,
+    enters: IntArray,
+    exits: IntArray,
+    owners: IntArray,
+    start: int,
+) -> int:
+    """Lay closures from position `start` on around what is there; return where it stopped for want of pool slots.
+
+    What lies already there stays, so that the rest can be laid by calling it again from where it stopped.
+    """
+    for n in range(start, blocks.shape[0]):
+        block, begins, ends = blocks[n], enters[n], exits[n]
+        g = ended_by(table, pool, block, begins)
+        while begins < ends:
+            until = ends
+            if g < table[block, COUNT]:
+                slot = table[block, FIRST] + g
+                if pool[slot, ENTER] <= begins:
+                    begins = pool[slot, EXIT]
+                    g += 1
+                    continue
+                until = min(ends, pool[slot, ENTER])
+            if not make_room(table, pool, chains, block):
+                return n
+            first, count = table[block, FIRST], table[block, COUNT]
+            for later in range(first + count, first + g, -1):
+                move(pool, later - 1, later)
+            pool[first + g, ENTER] = begins
+            pool[first + g, EXIT] = until
+            pool[first + g, OWNER] = owners[n]
+            table[block, COUNT] = count + 1
+            begins = until
+            g += 1
+    return blocks.shape[0]
+
+
+@allocating_kernel
+def owners_within(table: Int32Array, pool: IntArray, blocks: IntArray, enters: IntArray, exits: IntArray) -> IntArray:
+    """Return the owner of each reservation or part of a closure that overlaps the given intervals, repeats included."""
+    owners = np.empty(blocks.shape[0], dtype=np.int64)
+    found = 0
+    for n in range(blocks.shape[0]):
+        block = blocks[n]
+        first, count = table[block, FIRST], table[block, COUNT]
+        for slot in range(first + ended_by(table, pool, block, enters[n]), first + count):
+            if pool[slot, ENTER] >= exits[n]:
+                break
+            if found == owners.shape[0]:
+                larger = np.empty(2 * found, dtype=np.int64)
+                larger[:found] = owners
+                owners = larger
+            owners[found] = pool[slot, OWNER]
+            found += 1
+    return owners[:found].copy()

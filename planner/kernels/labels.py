@@ -29,12 +29,16 @@ LAST_STAMP = (1 << 30) - 1
 
 
 class Task(NamedTuple):
-    """One request: blocks, departure window, terminal dwell, the greedy search's hover limit, in ms; its stamp."""
+    """One request: blocks, departure window, terminal dwell, the greedy search's hover limit, in ms; its stamp.
+
+    `climb_out` is the dwell before the first link: none for a flight that is in the air already.
+    """
 
     origin: int
     destination: int
     earliest: int
     latest: int
+    climb_out: int
     dwell: int
     hover_limit: int
     stamp: int

@@ -89,7 +89,7 @@ def wait_early(
 @kernel
 def hold_on_ground(arrive: IntArray, depart: IntArray, task: Task) -> None:
     """Turn waiting in the first block into ground hold, as far as the departure window allows."""
-    arrive[0] = max(arrive[0], min(task.latest, depart[0] - task.dwell))
+    arrive[0] = max(arrive[0], min(task.latest, depart[0] - task.climb_out))
 
 
 @allocating_kernel

@@ -64,9 +64,9 @@ def open_departures(
         start, end = gap_bounds(table, pool, task.origin, gap, task.earliest)
         if start > task.latest or count == labels.shape[0]:
             break
-        if start + task.dwell + 1 <= end:
+        if start + task.climb_out + 1 <= end:
             add_label(marks, labels, task.stamp, count, task.origin, gap, start, end, h, rank)
-            labels[count, G] = start + task.dwell
+            labels[count, G] = start + task.climb_out
             labels[count, PARENT] = -1
             labels[count, START] = start
             count += 1
@@ -88,13 +88,14 @@ def earliest_landing(links: IntArray, table: Int32Array, pool: IntArray, task: T
     for link in range(26):
         entering = min(entering, links[link, TIME] - links[link, LEAD])
     gap = ended_by(table, pool, task.destination, soonest)
-    while True:
-        # The last gap has no end.
+    # Behind a closure without an end there is no landing any more.
+    while soonest < FAR_FUTURE:
         start, end = gap_bounds(table, pool, task.destination, gap, task.earliest)
-        landing = max(soonest, start + entering)
-        if landing + task.dwell + 1 <= end:
-            return landing
+        soonest = max(soonest, start + entering)
+        if soonest + task.dwell + 1 <= end:
+            break
         gap += 1
+    return soonest
 
 
 @kernel
@@ -152,6 +153,8 @@ def safe_interval(
     if count == labels.shape[0]:
         return WORKSPACE_FULL, -1, 0
     landing = earliest_landing(links, table, pool, task, labels[0, G] + h)
+    if landing >= FAR_FUTURE:
+        return NO_PATH, count, 0
     size = 0
     for label in range(count):
         size = open_label(heap, size, labels, label, max(labels[label, G] + h, landing), task.earliest)
