@@ -237,7 +237,7 @@ def _feature(member: Any, index: int) -> _Feature:
 
 def _footprints(features: list[_Feature], warnings: Counter[str]) -> tuple[list[_Feature], Geometries]:
     """Return the features whose polygons enclose an area, and these polygons, valid."""
-    footprints = _parsed([feature.geometry for feature in features])
+    footprints = parsed([feature.geometry for feature in features])
     for feature, footprint in zip(features, footprints, strict=True):
         if footprint is None:
             raise BuildingDataError(
@@ -259,7 +259,7 @@ def _footprints(features: list[_Feature], warnings: Counter[str]) -> tuple[list[
     return [feature for feature, keep in zip(features, solid, strict=True) if keep], footprints[solid]
 
 
-def _parsed(geometries: Sequence[Mapping[str, Any]]) -> Geometries:
+def parsed(geometries: Sequence[Mapping[str, Any]]) -> Geometries:
     """Return two-dimensional shapes of GeoJSON geometries, None where malformed."""
     shapes: Geometries = np.empty(len(geometries), dtype=object)
     with np.errstate(over="ignore"):
@@ -350,18 +350,27 @@ def _count_overlapping(footprints: Geometries) -> int:
 
 
 def _local_footprints(grid: AirMatrix, buildings: Sequence[Building]) -> Geometries:
-    """Return footprints in projected metres from the grid's origin: vertices projected, edges straight."""
-    footprints = _parsed([building.footprint for building in buildings])
-    degrees, owner = shapely.get_coordinates(footprints, return_index=True)
+    footprints = local_shapes(grid, parsed([building.footprint for building in buildings]))
+    lost = shapely.is_missing(footprints)
+    if lost.any():
+        first = buildings[int(np.argmax(lost))]
+        raise BuildingDataError(f"building {first.id!r} lies where EPSG:{grid.epsg} is undefined; check --epsg")
+    return footprints
+
+
+def local_shapes(grid: AirMatrix, shapes: Geometries) -> Geometries:
+    """Return valid shapes in projected metres from the grid's origin: vertices projected, edges straight; None for
+    those that lie where the projection is undefined.
+    """
+    degrees, owner = shapely.get_coordinates(shapes, return_index=True)
     x, y = grid.project(degrees[:, 0], degrees[:, 1])
     local = np.column_stack([x - grid.origin_x_m, y - grid.origin_y_m])
     lost = ~np.isfinite(local).all(axis=1)
-    if lost.any():
-        first = buildings[owner[np.argmax(lost)]]
-        raise BuildingDataError(f"building {first.id!r} lies where EPSG:{grid.epsg} is undefined; check --epsg")
-    shapely.set_coordinates(footprints, local)  # in place
-    _repair(footprints)
-    return footprints
+    local[lost] = 0.0
+    projected: Geometries = np.asarray(shapely.set_coordinates(shapes.copy(), local))
+    _repair(projected)
+    projected[owner[lost]] = None
+    return projected
 
 
 def _check_area_of_use(grid: AirMatrix) -> None:
@@ -390,7 +399,7 @@ def _occupied(
     highest_m = np.zeros((count_j, count_i))
     for done, (footprint, building) in enumerate(zip(footprints, buildings, strict=True), start=1):
         if not footprint.is_empty:
-            cells = _overlapped_cells(grid, footprint)
+            cells = overlapped_cells(grid, footprint)
             highest_m[cells] = np.maximum(highest_m[cells], building.height_m)
         if on_progress is not None:
             on_progress(done)
@@ -399,7 +408,7 @@ def _occupied(
     return occupied.ravel()
 
 
-def _overlapped_cells(grid: AirMatrix, footprint: Any) -> tuple[IntArray, IntArray]:
+def overlapped_cells(grid: AirMatrix, footprint: Any) -> tuple[IntArray, IntArray]:
     """Return rows and columns of the cells that a footprint overlaps by more than `MIN_OVERLAP_M2`."""
     side = grid.block_side_m
     west, south, east, north = np.array(footprint.bounds) / side
