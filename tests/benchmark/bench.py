@@ -11,13 +11,14 @@ import numba
 import numpy as np
 
 from planner.warm_up import warm_up
-from tests.benchmark import city, committed, intents, measuring, peers
+from tests.benchmark import city, committed, intents, measuring, peers, together
 
 PARTS: dict[str, Callable[[int], None]] = {
     "intents": intents.measure,
     "committed": committed.measure,
     "city": city.measure,
     "peers": peers.measure,
+    "together": together.measure,
 }
 
 
