@@ -24,6 +24,8 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from app.client import authorization
+
 FloatArray = NDArray[np.float64]
 
 # What the service says of its own time on an accepted intent, in its Server-Timing header.
@@ -34,6 +36,7 @@ _COLUMNS = 2 + len(SERVER_PARTS)
 _PATH = "/v1/flight-intents"
 _HEADERS = {"Content-Type": "application/json"}
 _REFUSED = (HTTPStatus.CONFLICT, HTTPStatus.UNPROCESSABLE_ENTITY)
+_WAIT = (HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS)
 _TIMEOUT_S = 30.0
 _RECONNECT_S = 0.5
 # Servers close connections that idle longer, uvicorn after 5 s; that is no fault of theirs.
@@ -89,8 +92,9 @@ class Measurement:
 class ClosedLoop:
     """So many clients of the service at an address, whose connections outlive their runs; close them at the end."""
 
-    def __init__(self, url: str, clients: int, bodies: Iterator[bytes]) -> None:
-        self._clients = [_Client(url) for _ in range(clients)]
+    def __init__(self, url: str, clients: int, bodies: Iterator[bytes], token: str | None = None) -> None:
+        headers = _HEADERS | authorization(token)
+        self._clients = [_Client(url, headers) for _ in range(clients)]
         self._bodies = bodies
 
     def close(self) -> None:
@@ -190,7 +194,8 @@ class _Tally:
 class _Client:
     """One client and its connection."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, headers: dict[str, str]) -> None:
+        self._headers = headers
         # Read as `app.client` reads it.
         address = httpx.URL(url)
         host = address.raw_host.decode()
@@ -209,7 +214,7 @@ class _Client:
             if sent - self._answered > _IDLE_S:
                 self._connection.close()
             try:
-                self._connection.request("POST", self._path, body, _HEADERS)
+                self._connection.request("POST", self._path, body, self._headers)
                 response = self._connection.getresponse()
                 content = response.read()
             except (OSError, HTTPException) as error:
@@ -222,7 +227,7 @@ class _Client:
                 continue
             self._answered = time.perf_counter()
             tally.note(response, content, sent, self._answered)
-            if response.status == HTTPStatus.SERVICE_UNAVAILABLE:
+            if response.status in _WAIT:
                 run.pause(_retry_after_s(response))
 
     def hang_up(self) -> None:

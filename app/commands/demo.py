@@ -26,7 +26,7 @@ from app.commands.pilots import Dispatch, Pilots, Report, ServiceTime, at_work
 from app.commands.random_intents import Body, RandomIntents
 from app.commands.terminal import remark, show
 from app.errors import StartupError
-from app.routes.flight_intents import FlightIntentBody
+from app.routes.submissions import FlightIntentBody
 from planner.experiments.traffic import Od
 
 _LONGEST_S = 366 * 86_400.0

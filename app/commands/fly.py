@@ -15,6 +15,7 @@ from app.client import DEFAULT_URL, Client, grid_of
 from app.commands.deviations import Deviations, Kind
 from app.commands.pilots import Dispatch, Pilots, Report, ServiceTime
 from app.commands.terminal import remark, show, spread
+from app.commands.token import Token
 
 _LONGEST_S = 366 * 86_400.0
 _INTERRUPTED = 130
@@ -36,6 +37,7 @@ def fly(
     duration: Annotated[float | None, typer.Option(min=0.1, max=_LONGEST_S, help="Seconds to fly.")] = None,
     until_idle: Annotated[bool, typer.Option("--until-idle", help="Stop when no flight is left.")] = False,
     url: Annotated[str, typer.Option(help="The service.")] = DEFAULT_URL,
+    token: Token = None,
 ) -> None:
     """Fly the accepted flights of a service: activate each, and report where its aircraft is, until Ctrl-C.
 
@@ -45,10 +47,13 @@ def fly(
     `layer` flies a layer too high or too low; `hover` stops in mid-air; `lost` falls silent; with `intruder`, somebody
     without a flight intent crosses its way, reported as a track.
 
+    A token needs the scopes airmatrix.plan and airmatrix.monitor and, for intruders, airmatrix.surveillance. Name its
+    operator too: other operators' flights it sees, but cannot fly.
+
     All positions of a tick go in one request. While one is not answered none is sent, and the ticks missed are counted.
     """
     wish = parse_deviations(deviations, kinds, seed)
-    with Client(url, _TIMEOUT_S) as client:
+    with Client(url, _TIMEOUT_S, token=token) as client:
         grid = grid_of(client.airspace())
         clock = ServiceTime(client)
         dispatch = Dispatch(client, clock, grid, wish, operator)

@@ -14,7 +14,8 @@ from app.client import DEFAULT_URL, Client
 from app.commands.closed_loop import ClosedLoop, Measurement
 from app.commands.random_intents import RandomIntents
 from app.commands.terminal import progress_bar, remark, show, spread
-from app.routes.flight_intents import FlightIntentBody
+from app.commands.token import Token
+from app.routes.submissions import FlightIntentBody
 from app.times import now_ms
 from planner.experiments.traffic import Od
 
@@ -39,8 +40,11 @@ def load(
     ] = 24.0,
     seed: Annotated[int, typer.Option(min=0, help="The same seed asks for the same flights.")] = 1,
     od: Annotated[Od, typer.Option(help="Origins and destinations.")] = Od.UNIFORM,
-    operator: Annotated[str, typer.Option(help="The operator's name.")] = "load",
+    operator: Annotated[
+        str | None, typer.Option(help="The operator's name.  [default: the token's, load without one]")
+    ] = None,
     url: Annotated[str, typer.Option(help="The service.")] = DEFAULT_URL,
+    token: Token = None,
 ) -> None:
     """Submit random flights from many clients at a time, and measure how many are accepted and how fast.
 
@@ -50,14 +54,16 @@ def load(
     sent; what is under way is waited for, 30 seconds at most. Ctrl-C ends it at once, with the figures so far.
     Exit status 1 if nothing was accepted.
     """
-    with Client(url) as client:
+    if operator is None and token is None:
+        operator = "load"
+    with Client(url, token=token) as client:
         demand = RandomIntents.served_by(client, od)
     wanted = demand.bodies(limit + _MOST_REQUESTS, now_ms() + 60_000, window * 3600, seed, operator)
     first = next(wanted)
     FlightIntentBody.model_validate(first)
     bodies = map(orjson.dumps, chain([first], wanted))
     ahead = min(_MOST_PREPARED, int(warm_up * _PREPARED_PER_S) + min(limit, int(duration * _PREPARED_PER_S)))
-    with closing(ClosedLoop(url, clients, chain(_prepared(bodies, ahead), bodies))) as loop:
+    with closing(ClosedLoop(url, clients, chain(_prepared(bodies, ahead), bodies), token)) as loop:
         if warm_up and _measured(loop, "warm-up", warm_up).interrupted:
             remark("interrupted", "yellow", "in the warm-up; what was accepted stays reserved")
             raise typer.Exit(1)

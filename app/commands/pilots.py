@@ -24,7 +24,7 @@ from app.client import Client, ProblemAnswer, ServiceUnreachable
 from app.commands.deviations import Deviations, Flown
 from app.commands.flight_model import Way, places, planned_way
 from app.flight_intents import OPEN_STATES, State
-from app.routes.flight_intents import FlightIntentAnswer
+from app.routes.answers import FlightIntentAnswer
 from app.times import format_time
 from planner.airmatrix import AirMatrix
 

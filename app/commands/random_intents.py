@@ -39,8 +39,11 @@ class RandomIntents:
         aircraft = tuple(id_ for id_ in PAPER_AIRCRAFT if id_ in known) or known
         return cls(f"{answer.name}, {answer.occupancy_rule}, {answer.search}", grid, places, aircraft)
 
-    def bodies(self, flights: int, start_ms: int, window_s: float, seed: int, operator: str) -> Iterator[Body]:
-        """Yield the requests of flights that want to depart within the window; one seed, one sequence of flights."""
+    def bodies(self, flights: int, start_ms: int, window_s: float, seed: int, operator: str | None) -> Iterator[Body]:
+        """Yield the requests of flights that want to depart within the window; one seed, one sequence of flights.
+
+        Without an operator, they are the token's.
+        """
         wishes = random_flights(self.terminals, self.aircraft, flights, window_s, seed)
         for number, wish in enumerate(wishes, start=1):
             origin, destination = self._ends(wish)

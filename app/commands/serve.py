@@ -2,6 +2,7 @@
 
 import gc
 import os
+import resource
 import signal
 import socket
 import sys
@@ -16,8 +17,10 @@ from typing import Annotated
 import structlog
 import typer
 import uvicorn
+from fastapi import FastAPI
 
 from app import auth, logs, service
+from app.connections import Connection
 from app.errors import RequestError, StartupError
 from app.ledger import parse_location
 from app.main import create_app
@@ -31,6 +34,8 @@ from planner.errors import PlannerError
 log = structlog.get_logger()
 
 _GRACE_S = 5
+# Of the ledger, its temporary files, and whatever libraries open.
+_FILES = 256
 _REFUSED, _WRITER_DIED, _INTERRUPTED = 2, 70, 130
 
 
@@ -71,7 +76,7 @@ def serve(
     # Taken before anything is created; who connects early waits until everything is ready.
     with _listen(settings.host, settings.port) as listener:
         basis = service.prepare(settings)
-        if settings.allow_unauthenticated:
+        if settings.allow_unauthenticated and settings.jwks is None:
             log.warning("AIRMATRIX_ALLOW_UNAUTHENTICATED: anybody who reaches this address can plan and cancel flights")
         clock = ServerClock(settings.clock_start, settings.clock_rate)
         if clock.simulated:
@@ -125,18 +130,43 @@ def _work(basis: Basis, clock: ServerClock, listener: socket.socket, ready: Call
     # uvicorn ends by raising the signal that stopped it; a clean exit still closes the ledger.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(_WRITER_DIED if died.is_set() else 0))
     with service.started(basis, clock, clock.elapsed_ms, on_death=end) as running:
-        config = uvicorn.Config(
-            create_app(basis.settings, running=running),
-            access_log=False,
-            log_config=None,
-            timeout_graceful_shutdown=_GRACE_S,
-        )
+        config = configuration(create_app(basis.settings, running=running), basis.settings)
+        allow_files(basis.settings.max_connections)
         # All that is there by now stays: looking through it for garbage stopped every thread for a tenth of a second,
         # every second or two under load.
         gc.collect()
         gc.freeze()
         ready()
         _Server(config, running.closing).run(sockets=[listener])
+
+
+def configuration(app: FastAPI, settings: Settings) -> uvicorn.Config:
+    """Return how the application is served over sockets."""
+    return uvicorn.Config(
+        app,
+        http=Connection,
+        ws="none",
+        access_log=False,
+        log_config=None,
+        # A line for each request that is no HTTP would let strangers fill the disk; the metrics count those.
+        log_level="error",
+        server_header=False,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=settings.trusted_proxies,
+        timeout_graceful_shutdown=_GRACE_S,
+    )
+
+
+def allow_files(connections: int) -> None:
+    """Let this process open as many files as connections need, if the system does: the ledger must find one left."""
+    now, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = 2 * connections + _FILES
+    if now == resource.RLIM_INFINITY or now >= needed:
+        return
+    allowed = needed if most == resource.RLIM_INFINITY else min(needed, most)
+    if allowed < needed:
+        log.warning("fewer files may be open than connections need", allowed=allowed, needed=needed)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, most))
 
 
 class _Server(uvicorn.Server):

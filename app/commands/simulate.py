@@ -13,7 +13,9 @@ from rich.table import Table
 from app.client import DEFAULT_URL, Client, ProblemAnswer
 from app.commands.random_intents import RandomIntents
 from app.commands.terminal import progress_bar, remark, show, spread
-from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody
+from app.commands.token import Token
+from app.routes.answers import FlightIntentAnswer
+from app.routes.submissions import FlightIntentBody
 from app.times import now_ms, parse_time
 from planner.experiments.traffic import Od
 
@@ -38,8 +40,11 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="The same seed asks for the same flights.")] = 1,
     od: Annotated[Od, typer.Option(help="Origins and destinations.")] = Od.UNIFORM,
     start: Annotated[str | None, typer.Option(help="Begin of the window, RFC 3339. Default: in 60 s.")] = None,
-    operator: Annotated[str, typer.Option(help="The operator's name.")] = "simulator",
+    operator: Annotated[
+        str | None, typer.Option(help="The operator's name.  [default: the token's, simulator without one]")
+    ] = None,
     url: Annotated[str, typer.Option(help="The service.")] = DEFAULT_URL,
+    token: Token = None,
 ) -> None:
     """Submit random flights one after another and sum up what became of them."""
     try:
@@ -48,8 +53,10 @@ def simulate(
         raise typer.BadParameter(str(error), param_hint="--start") from error
     if not math.isfinite(window):
         raise typer.BadParameter("expected a number of seconds", param_hint="--window")
+    if operator is None and token is None:
+        operator = "simulator"
     tally = Tally()
-    with Client(url) as client:
+    with Client(url, token=token) as client:
         demand = RandomIntents.served_by(client, od)
         began = time.perf_counter()
         interrupted = False
