@@ -11,7 +11,7 @@ import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uuid_utils import uuid7
 
-from app.errors import QueueFull
+from app.errors import QueueFull, TooManyConnections, TooManyStreams
 from app.metrics import OTHER
 from app.problems import KINDS, MEDIA_TYPE
 from app.service import Service
@@ -22,7 +22,7 @@ _HEADER = b"x-request-id"
 _ID = re.compile(rb"[A-Za-z0-9._:-]{1,100}")
 _IS_PROBLEM = (b"content-type", MEDIA_TYPE.encode())
 # Shedding load must not fill a disk with lines about it; the metrics count it.
-_SHED = KINDS[QueueFull].slug
+_SHED = {KINDS[error].slug for error in (QueueFull, TooManyConnections, TooManyStreams)}
 
 
 class _Answer:
@@ -94,7 +94,7 @@ def _note_answer(service: Service, scope: Scope, answer: _Answer, seconds: float
     if answer.problem is not None:
         details["problem"] = slug = answer.problem["type"].rpartition("/")[2]
         service.metrics.problem(slug, answer.problem.get("reason"))
-    write = log.warning if answer.status >= 500 and details.get("problem") != _SHED else log.debug
+    write = log.warning if answer.status >= 500 and details.get("problem") not in _SHED else log.debug
     # A log that cannot be written is no reason to break off an answer.
     with suppress(OSError, ValueError):
         write("request", method=method, route=route, status=answer.status, ms=round(seconds * 1000, 3), **details)
