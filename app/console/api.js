@@ -1,4 +1,6 @@
-/** Requests to the service. The only place that calls fetch. */
+/** Requests to the service, with the token of who is at the console. The only place that calls fetch. */
+
+import { askForToken, token } from "/console/session.js";
 
 /** What went wrong: `problem` is the answer's problem document (RFC 9457), null where there was no answer. */
 class RequestFailed extends Error {
@@ -42,15 +44,27 @@ async function request(path, options) {
 }
 
 async function answer(path, options) {
+  const sent = token();
+  const headers = { ...options.headers, ...(sent === null ? {} : { Authorization: `Bearer ${sent}` }) };
   let response;
   try {
-    response = await fetch(path, options);
+    response = await fetch(path, { ...options, headers });
   } catch (error) {
     throw aborted(error) ? error : new RequestFailed("the service cannot be reached");
   }
   if (response.ok) return response;
   const problem = await response.json().catch(() => null);
+  if (response.status === 401) {
+    // Meanwhile another request may have got a token.
+    if (token() === sent) await askForToken(refusal(problem, sent));
+    return answer(path, options);
+  }
   throw new RequestFailed(problem?.detail ?? `the service answered ${response.status}`, problem);
+}
+
+function refusal(problem, sent) {
+  if (sent === null) return "This service wants to know who you are.";
+  return `The token was not accepted${problem?.detail ? `: ${problem.detail}` : ""}.`;
 }
 
 /** Tell whether a request ended because nobody wants its answer any more. */

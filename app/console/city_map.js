@@ -6,6 +6,7 @@ import { palette } from "/console/palette.js";
 /** Drawn in this order: what matters most is not hidden behind what matters less. */
 const STATUSES = ["red", "yellow", "green"];
 const OPACITY = { red: 0.72, yellow: 0.6, green: 0.34 };
+const CLOSED = "closed";
 const HATCH_PX = 32;
 /** Tiles this deep are precise to decimetres, and so few that thousands of blocks are cut up in no time. */
 const DEEPEST_TILE = 14;
@@ -63,10 +64,10 @@ export class CityMap {
     ]);
     map.setPaintProperty("green", "fill-extrusion-color", colours.green);
     for (const status of ["yellow", "red"]) {
-      const image = hatch(status, colours[status]);
-      if (map.hasImage(status)) map.updateImage(status, image);
-      else map.addImage(status, image, { pixelRatio: 2 });
+      this.#setImage(status, hatch(status, colours[status]));
     }
+    this.#setImage(CLOSED, stripes(colours.red));
+    map.setPaintProperty("closed-edge", "line-color", colours.red);
   }
 
   /** Show these blocks, entries of a status answer. */
@@ -84,6 +85,25 @@ export class CityMap {
         geometry: { type: "Polygon", coordinates: [this.#ring(block)] },
       })),
     });
+  }
+
+  /** Show closed airspace: constraints, up to the ceiling where they have no top. */
+  showConstraints(constraints) {
+    const ceiling = this.#grid.dimensions[2] * this.#grid.height;
+    this.#map.getSource(CLOSED).setData({
+      type: "FeatureCollection",
+      features: constraints.map(({ name, polygon, base_m: base, top_m: top }) => ({
+        type: "Feature",
+        properties: { name, base: Math.max(base, 0), top: Math.min(top ?? ceiling, ceiling) },
+        geometry: polygon,
+      })),
+    });
+  }
+
+  /** Return the names of the constraints at a point of the canvas. */
+  constraintsAtPoint(point) {
+    const found = this.#map.queryRenderedFeatures([point.x, point.y], { layers: [CLOSED] });
+    return [...new Set(found.map(({ properties }) => properties.name))];
   }
 
   /** Show seconds of use of columns of blocks, `[i, j, seconds]`, and return the most. */
@@ -127,6 +147,11 @@ export class CityMap {
     return { center: above.center, zoom: above.zoom + 0.08, pitch: 50, bearing: -14 };
   }
 
+  #setImage(name, image) {
+    if (this.#map.hasImage(name)) this.#map.updateImage(name, image);
+    else this.#map.addImage(name, image, { pixelRatio: 2 });
+  }
+
   #ring(block) {
     const key = block[0] * this.#grid.dimensions[1] + block[1];
     if (!this.#rings.has(key)) this.#rings.set(key, this.#grid.ring(block, 0.03));
@@ -146,6 +171,7 @@ export class CityMap {
         heat: shapes(empty),
         buildings: shapes(buildings, 15),
         blocks: shapes(empty),
+        [CLOSED]: shapes(empty),
       },
       layers: [
         { id: "outside", type: "background" },
@@ -178,6 +204,17 @@ export class CityMap {
             "fill-extrusion-vertical-gradient": false,
           },
         })),
+        { id: "closed-edge", type: "line", source: CLOSED, paint: { "line-width": 1.5 } },
+        {
+          id: CLOSED, type: "fill-extrusion", source: CLOSED,
+          paint: {
+            "fill-extrusion-pattern": CLOSED,
+            "fill-extrusion-base": ["get", "base"],
+            "fill-extrusion-height": ["get", "top"],
+            "fill-extrusion-opacity": 0.45,
+            "fill-extrusion-vertical-gradient": false,
+          },
+        },
       ],
     };
   }
@@ -195,6 +232,21 @@ export class CityMap {
 
 function flightMs() {
   return matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 900;
+}
+
+/** Return the fill of closed airspace: stripes with nothing between them, for what is inside is to be seen. */
+function stripes(colour) {
+  const canvas = new OffscreenCanvas(HATCH_PX, HATCH_PX);
+  const context = canvas.getContext("2d");
+  context.strokeStyle = colour;
+  context.lineWidth = 6;
+  for (const shift of [-1, 0, 1]) {
+    context.beginPath();
+    context.moveTo(shift * HATCH_PX, 0);
+    context.lineTo((shift + 1) * HATCH_PX, HATCH_PX);
+    context.stroke();
+  }
+  return context.getImageData(0, 0, HATCH_PX, HATCH_PX);
 }
 
 /** Return a status's fill: hatched one way for yellow and both ways for red; green is plain. */

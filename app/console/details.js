@@ -18,7 +18,10 @@ export class Details {
   #live;
   #request = null;
 
-  /** `actions`: `choose(selection)`, `showPath(intent)`, `fail(error)`, `flight(id)`, `entry(key)`, `now()`. */
+  /**
+   * `actions`: `choose(selection)`, `showPath(intent)`, `fail(error)`, `flight(id)`, `entry(key)`, `now()`, and
+   * `constraint(id)`, which returns its name.
+   */
   constructor(place, grid, colours, actions) {
     this.#place = place;
     this.#grid = grid;
@@ -139,7 +142,8 @@ export class Details {
   #plan(intent) {
     const now = this.#actions.now();
     const time = (text) => `${clockTime(Date.parse(text))} UTC, ${relative(Date.parse(text), now)}`;
-    const found = intent.refusal ? [["Refused", intent.refusal.detail]] : [
+    const refused = intent.state === "rejected" ? "Refused" : "Displaced";
+    const found = intent.refusal ? [[refused, intent.refusal.detail]] : [
       ["Departure", time(intent.departure)],
       ["Arrival", time(intent.arrival)],
       ["Flight time", span(intent.flight_time_s)],
@@ -173,10 +177,13 @@ export class Details {
     ].filter(Boolean);
   }
 
-  #schedule({ schedule, statically_occupied: occupied }) {
-    if (occupied) return [element("p", { class: "hint", text: "A building stands here: nothing can be reserved." })];
-    if (schedule.length === 0) return [element("p", { class: "hint", text: "Nothing is reserved from now on." })];
+  #schedule({ schedule, statically_occupied: occupied, constraints }) {
+    const hint = (text) => element("p", { class: "hint", text });
+    const closed = constraints.map((id) => hint(`Closed: ${this.#actions.constraint(id)}.`));
+    if (occupied) return [...closed, hint("A building stands here: nothing can be reserved.")];
+    if (schedule.length === 0) return [...closed, hint("Nothing is reserved from now on.")];
     return [
+      ...closed,
       element("h3", { text: `Reserved from now on (${schedule.length})` }),
       this.#table(["Flight", "From", "To"], schedule, ({ flight_intent_id: id, enter, exit }) => [
         this.#userLink({ kind: "flight", id }), clockTime(Date.parse(enter)), clockTime(Date.parse(exit)),

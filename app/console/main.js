@@ -3,6 +3,7 @@
 import { AlertsPanel } from "/console/alerts.js";
 import { aborted, get } from "/console/api.js";
 import { CityMap, HEAT_RAMP } from "/console/city_map.js";
+import { ConstraintsPanel, constraintsAt, isInForce, middleOf } from "/console/constraints.js";
 import { Details } from "/console/details.js";
 import { byId, element, navigable, setText, statusChip } from "/console/dom.js";
 import { Filters } from "/console/filters.js";
@@ -13,6 +14,7 @@ import { NewFlight } from "/console/new_flight.js";
 import { palette } from "/console/palette.js";
 import { Picture } from "/console/picture.js";
 import { aircraftAt, blocksAt } from "/console/planned.js";
+import { startSession } from "/console/session.js";
 import { listenToKeys } from "/console/shortcuts.js";
 import { follow } from "/console/stream.js";
 import { symbolCanvas } from "/console/symbols.js";
@@ -41,9 +43,14 @@ class Console {
   #flights;
   #details;
   #newFlight;
+  #constraintsPanel;
+  /** The constraints in force and to come, and the ids of those on the map. */
+  #constraints = [];
+  #constraintsRequest = null;
+  #closed = "";
   /** `{kind: "flight" | "track", id}`, `{kind: "block", block}` or null. */
   #selection = null;
-  /** `{blocks, counts, flying}` of a moment other than the present; null while live. */
+  /** `{blocks, counts, flying, constraints}` of a moment other than the present; null while live. */
   #moment = null;
   #momentRequest = null;
   #heatRequest = null;
@@ -52,6 +59,7 @@ class Console {
   /** Read what does not change, draw the map, then follow the stream. */
   async start() {
     startTheme(() => this.#paint());
+    startSession();
     const [airspace, buildings] = await Promise.all([get("/v1/airspace"), get("/v1/airspace/buildings")]);
     showAirspace(airspace);
     this.#grid = new Grid(airspace);
@@ -77,6 +85,7 @@ class Console {
       onOpen: () => this.#picture.opened(),
       onLost: () => this.#picture.lost(),
       onEvent: (event, data) => this.#picture.take(event, data),
+      onRefused: (why) => this.#picture.refused(why),
     });
   }
 
@@ -122,8 +131,11 @@ class Console {
       showPath: (intent) => this.#traffic.showPath(intent.trajectory, intent.reservations),
       flight: (id) => this.#picture.flights.find((flight) => idOf(flight) === id) ?? null,
       entry: (key) => this.#blocks().get(key) ?? null,
+      constraint: (id) => this.#constraints.find((each) => each.id === id)?.name ?? id,
       fail: (error) => this.#notice(error.message),
     });
+    this.#constraintsPanel = new ConstraintsPanel(byId("constraints"), byId("constraints-list"),
+      (constraint) => this.#city.flyTo(middleOf(constraint)));
     this.#newFlight = new NewFlight(this.#grid, {
       choose,
       now,
@@ -181,13 +193,21 @@ class Console {
       this.#showLists();
     });
     picture.addEventListener("alerts", () => this.#showLists());
-    picture.addEventListener("link", () => this.#refresh());
+    picture.addEventListener("link", () => {
+      this.#refresh();
+      // What was closed or opened while nobody listened.
+      if (picture.connected) this.#loadConstraints();
+    });
     picture.addEventListener("tick", () => this.#refresh());
     picture.addEventListener("intent", ({ detail: entry }) => {
       setText(byId("latest"), journalWords(entry));
       if (this.#selection?.id === entry.flight_intent_id) this.#showDetails();
     });
     picture.addEventListener("conformance", ({ detail: entry }) => setText(byId("latest"), journalWords(entry)));
+    picture.addEventListener("constraint", ({ detail: entry }) => {
+      setText(byId("latest"), journalWords(entry));
+      this.#loadConstraints();
+    });
   }
 
   #showLists() {
@@ -208,6 +228,30 @@ class Console {
     else if (this.#picture.now !== null) showCounts(this.#picture.counts, flying.length);
     this.#timeline.refresh();
     this.#details.refresh();
+    this.#showConstraints();
+  }
+
+  async #loadConstraints() {
+    this.#constraintsRequest?.abort();
+    this.#constraintsRequest = new AbortController();
+    try {
+      this.#constraints = await constraintsAt(null, this.#constraintsRequest.signal);
+      this.#showConstraints();
+    } catch (error) {
+      if (!aborted(error)) this.#notice(`Closed airspace: ${error.message}`);
+    }
+  }
+
+  /** Show what is closed at the time shown: constraints begin and end by themselves. */
+  #showConstraints() {
+    const time = this.#timeline.moment ?? this.#picture.now;
+    if (time === null) return;
+    const constraints = this.#moment?.constraints ?? this.#constraints;
+    this.#constraintsPanel.show(constraints, time);
+    const inForce = constraints.filter((constraint) => isInForce(constraint, time));
+    const closed = inForce.map(({ id }) => id).join();
+    if (closed !== this.#closed) this.#city.showConstraints(inForce);
+    this.#closed = closed;
   }
 
   /** Return the blocks in use at the time shown, by key. */
@@ -256,9 +300,11 @@ class Console {
     }
     const { signal } = this.#momentRequest = new AbortController();
     try {
-      const [{ blocks, counts }, aircraft] = await Promise.all([blocksAt(moment, signal), aircraftAt(moment, signal)]);
+      const [{ blocks, counts }, aircraft, constraints] = await Promise.all([
+        blocksAt(moment, signal), aircraftAt(moment, signal), constraintsAt(moment, signal),
+      ]);
       const byKey = new Map(blocks.map((entry) => [keyOf(entry.block), entry]));
-      this.#takeMoment({ counts, blocks: byKey, flying: aircraft.length }, aircraft);
+      this.#takeMoment({ counts, blocks: byKey, flying: aircraft.length, constraints }, aircraft);
     } catch (error) {
       if (!aborted(error)) this.#notice(`${clockTime(moment)} UTC: ${error.message}`);
     }
@@ -331,6 +377,7 @@ class Console {
       const flight = this.#newFlight.picking === null ? this.#traffic.at(point) : null;
       this.#traffic.hovered = flight ? idOf(flight) : null;
       map.getCanvas().style.cursor = flight ? "pointer" : "";
+      map.getCanvas().title = this.#closed ? this.#city.constraintsAtPoint(point).join(", ") : "";
     });
   }
 

@@ -2,6 +2,7 @@
 
 import { get, post } from "/console/api.js";
 import { byId, element, facts, setText } from "/console/dom.js";
+import { token } from "/console/session.js";
 import { clockTime, relative, span } from "/console/time.js";
 import { explained } from "/console/words.js";
 
@@ -84,7 +85,8 @@ export class NewFlight {
     for (const button of buttons) button.disabled = true;
     try {
       const intent = await post(path, {
-        operator: byId("new-operator").value.trim(),
+        // Who has a token is named by it.
+        operator: token() === null ? byId("new-operator").value.trim() : undefined,
         reference: byId("new-reference").value.trim() || null,
         aircraft_type: byId("new-aircraft").value,
         ...this.ends,
@@ -103,7 +105,7 @@ export class NewFlight {
   #missing() {
     if (this.ends.origin === null) return "Choose the origin on the map.";
     if (this.ends.destination === null) return "Choose the destination on the map.";
-    if (byId("new-operator").value.trim() === "") return "Name the operator.";
+    if (token() === null && byId("new-operator").value.trim() === "") return "Name the operator.";
     if (!byId("new-departure").checkValidity() || byId("new-departure").value === "") {
       return "Say in how many minutes the flight shall depart.";
     }

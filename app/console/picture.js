@@ -6,8 +6,8 @@ import { keyOf } from "/console/grid.js";
 const STALE_MS = 3_500;
 
 /**
- * Tells of changes by events: `tick`, `blocks`, `flights`, `alerts`, `link` (the connection), `intent` and
- * `conformance` (detail: the journal's entry). Takes the time from outside, so that tests can choose it.
+ * Tells of changes by events: `tick`, `blocks`, `flights`, `alerts`, `link` (the connection), `intent`, `conformance`
+ * and `constraint` (detail: the journal's entry). Takes the time from outside, so that tests can choose it.
  */
 export class Picture extends EventTarget {
   /** Blocks in use by key. */
@@ -18,6 +18,8 @@ export class Picture extends EventTarget {
   rate = 1;
   simulated = false;
   connected = false;
+  /** Why the service does not show it to who is here, null if it does. */
+  refusal = null;
   #whole = false;
   #clockMs = null;
   #clockReadAt = 0;
@@ -44,8 +46,9 @@ export class Picture extends EventTarget {
     return this.#clockMs + silent * this.rate;
   }
 
-  /** How the connection is: `connecting`, `live`, `stale` (connected but silent) or `reconnecting`. */
+  /** How the connection is: `connecting`, `live`, `stale` (connected but silent), `reconnecting` or `refused`. */
   get state() {
+    if (this.refusal !== null) return "refused";
     if (!this.connected) return this.#tickAt === null ? "connecting" : "reconnecting";
     if (this.#tickAt === null) return "connecting";
     return this.#monotonic() - this.#tickAt < STALE_MS ? "live" : "stale";
@@ -69,6 +72,13 @@ export class Picture extends EventTarget {
     this.#tell("link");
   }
 
+  /** The stream is not for who is here. */
+  refused(why) {
+    this.connected = false;
+    this.refusal = why;
+    this.#tell("link");
+  }
+
   /** Take an event of the stream. */
   take(event, data) {
     if (event === "status") this.#takeStatus(data);
@@ -80,7 +90,7 @@ export class Picture extends EventTarget {
       this.alerts = data.items;
       this.#tell("alerts");
     }
-    if (event === "intent" || event === "conformance") this.#tell(event, data);
+    if (["intent", "conformance", "constraint"].includes(event)) this.#tell(event, data);
   }
 
   #takeStatus(data) {

@@ -19,7 +19,7 @@ export function listenToKeys(shortcuts, { escape, enter }) {
     element("dd", { text: words }),
   ]));
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || help.open) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     if (event.key === "Escape") escape();
     if (event.target.matches(WRITING)) return;
     const shortcut = all.find(([key]) => key.toLowerCase() === event.key.toLowerCase());

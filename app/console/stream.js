@@ -13,8 +13,11 @@ export function waitMs(failures, random = Math.random()) {
   return longest * (0.5 + random / 2);
 }
 
-/** Read the stream until the page closes; `onOpen` and `onLost` are told when it begins and ends. */
-export async function follow({ onOpen, onEvent, onLost }) {
+/**
+ * Read the stream until the page closes; `onOpen` and `onLost` are told when it begins and ends. `onRefused` is told
+ * why if the token is not for it, which asking again would not change.
+ */
+export async function follow({ onOpen, onEvent, onLost, onRefused }) {
   const memory = { lastId: null };
   let failures = 0;
   for (;;) {
@@ -28,6 +31,10 @@ export async function follow({ onOpen, onEvent, onLost }) {
       });
     } catch (error) {
       console.info(`event stream: ${error.message}`);
+      if (error.problem?.status === 403) {
+        onRefused(error.message);
+        return;
+      }
     }
     failures += 1;
     onLost();

@@ -5,7 +5,7 @@ import { clockTime, date, span } from "/console/time.js";
 import { STATUS_WORDS } from "/console/words.js";
 
 const STATUSES = ["green", "yellow", "red"];
-const LINK_WORDS = { connecting: "Connecting", live: "Live", stale: "Stale", reconnecting: "Reconnecting" };
+const LINK_WORDS = { connecting: "Connecting", live: "Live", stale: "Stale", reconnecting: "Reconnecting", refused: "Refused" };
 
 /** Name the airspace, and whose data it is. */
 export function showAirspace({ name, attribution, licence }) {
@@ -23,7 +23,7 @@ export function showAirspace({ name, attribution, licence }) {
 }
 
 /** Show the clock and how old the picture is. */
-export function showLink({ now, rate, simulated, state, silentSeconds }) {
+export function showLink({ now, rate, simulated, state, silentSeconds, refusal }) {
   if (now !== null) {
     setText(byId("clock-time"), clockTime(now));
     setText(byId("clock-date"), date(now));
@@ -34,11 +34,12 @@ export function showLink({ now, rate, simulated, state, silentSeconds }) {
   setText(byId("link"), LINK_WORDS[state]);
   const old = state === "stale" || state === "reconnecting";
   document.body.classList.toggle("old", old);
-  byId("stale").hidden = !old;
+  byId("stale").hidden = !old && refusal === null;
   if (old) {
     const again = state === "reconnecting" ? ", connecting again" : "";
     setText(byId("stale"), `Stale since ${span(silentSeconds)}: the service is not heard${again}.`);
   }
+  if (refusal !== null) setText(byId("stale"), `Not shown: ${refusal}. Sign out to use another token.`);
 }
 
 /** Show how many blocks have which status, and how many aircraft fly. */

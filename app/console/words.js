@@ -30,7 +30,7 @@ const BLOCK_REASONS = {
   several_aircraft: "several aircraft are here at once",
   reserved_by_another: "an aircraft is here, and another flight has reserved the block",
   in_building: "an aircraft is where a building stands",
-  in_constraint: "an aircraft is in a closed volume",
+  in_constraint: "an aircraft is in closed airspace",
   not_accepted: "an aircraft flies here without an accepted plan",
 };
 
@@ -46,7 +46,7 @@ const FLIGHT_REASONS = {
   several_aircraft: "shares a block with another aircraft",
   reserved_by_another: "in a block reserved by another flight",
   in_building: "where a building stands",
-  in_constraint: "in a closed volume",
+  in_constraint: "in closed airspace",
   not_activated: "flies without having been activated",
   not_accepted: "flies without an accepted plan",
   no_flight_intent: "no flight intent belongs to it",
@@ -59,7 +59,7 @@ const REFUSALS = {
   same_block: "Origin and destination lie in the same block: there is nothing to plan.",
   disconnected: "Buildings leave no way from the origin to the destination, whatever the traffic.",
   no_departure_slot: "Within the departure window the origin's block is never free for long enough.",
-  no_conflict_free_path: "Within the departure window the other flights leave no way through.",
+  no_conflict_free_path: "Within the departure window other flights and closed airspace leave no way through.",
   endurance_exceeded: "A way exists, but it takes longer than this aircraft can stay in the air.",
 };
 
@@ -105,7 +105,22 @@ export function flightName({ reference, operator, sequence, track_id: track }) {
   return reference ?? `${operator} #${sequence}`;
 }
 
+const CONSTRAINT_EVENTS = {
+  constraint_created: "airspace closed",
+  constraint_removed: "closed airspace opened",
+};
+
 /** Return a journal entry in words. */
-export function journalWords({ kind, sequence, track_id: track, time }) {
-  return `${track ? `track ${track}` : `#${sequence}`} ${kind} at ${clockTime(Date.parse(time))} UTC`;
+export function journalWords(entry) {
+  const { kind, sequence, track_id: track, time } = entry;
+  const what = CONSTRAINT_EVENTS[kind] ?? `${track ? `track ${track}` : `#${sequence}`} ${became(entry)}`;
+  return `${what} at ${clockTime(Date.parse(time))} UTC`;
+}
+
+/** Return what became of a flight: its state or, where it was planned again and still flies, how. */
+function became({ kind, details }) {
+  if (kind === "displaced" || details.cause === undefined) return kind;
+  if (details.cause === null) return "changed";
+  const moved = details.arrival_moved_s;
+  return `made way, arrives ${Math.abs(moved).toFixed(1)} s ${moved < 0 ? "sooner" : "later"}`;
 }

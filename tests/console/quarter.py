@@ -82,6 +82,16 @@ class Quarter:
         """Say that a flight is about to depart."""
         self._http.post(f"/v1/flight-intents/{intent['id']}/activate").raise_for_status()
 
+    def post(self, path: str, body: object) -> Any:
+        """Return the JSON of the answer to a POST that makes something."""
+        answer = self._http.post(path, json=body)
+        assert answer.status_code == 201, answer.text
+        return answer.json()
+
+    def delete(self, path: str) -> None:
+        """Delete something."""
+        self._http.delete(path).raise_for_status()
+
     def report(self, block: Block, **who: str) -> None:
         """Report an aircraft in the middle of a block."""
         lon, lat, alt_m = place(block)

@@ -216,3 +216,31 @@ def test_the_scene_counts_in_metres_from_its_origin(modules: Watched) -> None:
     )
     assert local[0] == pytest.approx([0, 0, 33], abs=1e-6)
     assert local[1] == pytest.approx([699, 1112, 0], rel=0.005)
+
+
+def test_the_journal_says_of_a_flight_that_was_planned_again_what_became_of_it(modules: Watched) -> None:
+    cause = {"flight_intent_id": "x"}
+    entries = [
+        {"kind": kind, "sequence": 7, "track_id": None, "time": "2026-11-22T08:00:00.000Z", "details": details}
+        for kind, details in [
+            ("accepted", {}),
+            ("accepted", {"cause": None, "arrival_moved_s": 4.0}),
+            ("accepted", {"cause": cause, "arrival_moved_s": 4.26}),
+            ("accepted", {"cause": cause, "arrival_moved_s": -1.0}),
+            ("displaced", {"cause": cause, "arrival_moved_s": None}),
+        ]
+    ]
+    told = modules.run(
+        """async (entries) => {
+            const { journalWords } = await import("/console/words.js");
+            return entries.map(journalWords);
+        }""",
+        entries,
+    )
+    assert [words.removesuffix(" at 08:00:00 UTC") for words in told] == [
+        "#7 accepted",
+        "#7 changed",
+        "#7 made way, arrives 4.3 s later",
+        "#7 made way, arrives 1.0 s sooner",
+        "#7 displaced",
+    ]
