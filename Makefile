@@ -5,7 +5,7 @@ INSTALLED := $(VENV)/.installed
 PEERS := $(VENV)/.peers
 
 .DEFAULT_GOAL := help
-.PHONY: help install serve demo test bench faults soak screenshots lint lock openapi
+.PHONY: help install serve demo test bench contract faults soak screenshots lint lock openapi
 
 help:  ## Show these targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -25,8 +25,9 @@ serve: $(INSTALLED)  ## Run the service on http://127.0.0.1:8000
 demo: $(INSTALLED)  ## Show it: a service, traffic, flying aircraft, and the console's address
 	@$(BIN)/airmatrix demo
 
+# Two processes halve the time; a file's tests stay together, for they share what is slow to set up.
 test: $(INSTALLED)  ## Run the tests
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 # Without their dependencies, which are locked already or not needed to run: so the environment stays the tested one.
 $(PEERS): $(INSTALLED) tests/benchmark/requirements.lock
@@ -35,6 +36,9 @@ $(PEERS): $(INSTALLED) tests/benchmark/requirements.lock
 
 bench: $(INSTALLED) $(PEERS)  ## Time the planner; choose with PARTS="intents committed city peers"
 	$(BIN)/python -m tests.benchmark.bench $(PARTS)
+
+contract: $(INSTALLED)  ## Hold the service to its OpenAPI document at length; choose with EXAMPLES=1000 SEED=7
+	$(BIN)/python -m tests.contract.campaign $(if $(EXAMPLES),--examples $(EXAMPLES)) $(if $(SEED),--seed $(SEED))
 
 faults: $(INSTALLED)  ## Break the service in every way we know; choose with PARTS="kill disk ..." ROUNDS=20
 	$(BIN)/python -m tests.faults.campaign $(PARTS) $(if $(ROUNDS),--rounds $(ROUNDS))

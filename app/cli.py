@@ -22,6 +22,7 @@ from app.commands.serve import serve
 from app.commands.simulate import simulate
 from app.commands.size_blocks import size_blocks
 from app.commands.terminal import remark, write
+from app.commands.token import print_token
 from app.commands.verify import verify
 from app.errors import RequestError, StartupError
 from app.main import create_app
@@ -44,6 +45,7 @@ cli.command()(load)
 cli.command()(fly)
 cli.command()(size_blocks)
 cli.command()(verify)
+cli.command("token")(print_token)
 
 
 def main() -> None:

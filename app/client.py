@@ -3,9 +3,11 @@
 ClientError
 ├── ServiceUnreachable   no answer
 ├── UnexpectedAnswer     an answer that is not AirMatrix's
+├── MalformedToken       what was given as a token is none
 └── ProblemAnswer        the service answered with a problem document
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -17,16 +19,20 @@ from pydantic import BaseModel, ValidationError
 from app.flight_intents import State
 from app.routes.aircraft_types import AircraftTypeAnswer, AircraftTypeList
 from app.routes.airspace import AirspaceAnswer, StaticAnswer
+from app.routes.answers import FlightIntentAnswer, FlightIntentPage, PlannedFlightBody
 from app.routes.events import EventPage
-from app.routes.flight_intents import FlightIntentAnswer, FlightIntentBody, FlightIntentPage, PlannedFlightBody
 from app.routes.flights import AlertList, FlightList
 from app.routes.health import Readiness
 from app.routes.status import StatusAnswer
+from app.routes.submissions import FlightIntentBody
 from app.routes.telemetry import TelemetryAnswer
 from app.times import format_time
 from planner.airmatrix import AirMatrix
 
 DEFAULT_URL = "http://127.0.0.1:8000"
+
+# RFC 6750: what follows `Bearer`.
+_TOKEN = re.compile(r"[A-Za-z0-9._~+/-]+=*")
 
 Answer = TypeVar("Answer", bound=BaseModel)
 
@@ -41,6 +47,10 @@ class ServiceUnreachable(ClientError):
 
 class UnexpectedAnswer(ClientError):
     """Something answered, but not like AirMatrix."""
+
+
+class MalformedToken(ClientError):
+    """What was given as a token is none."""
 
 
 class ProblemAnswer(ClientError):
@@ -62,10 +72,15 @@ class Client:
     """One connection pool to one service; use it as a context manager. Methods raise `ClientError`."""
 
     def __init__(
-        self, url: str = DEFAULT_URL, timeout_s: float = 30.0, transport: httpx.BaseTransport | None = None
+        self,
+        url: str = DEFAULT_URL,
+        timeout_s: float = 30.0,
+        transport: httpx.BaseTransport | None = None,
+        token: str | None = None,
     ) -> None:
+        headers = authorization(token)
         try:
-            self._http = httpx.Client(base_url=url, timeout=timeout_s, transport=transport)
+            self._http = httpx.Client(base_url=url, timeout=timeout_s, transport=transport, headers=headers)
         except httpx.InvalidURL as error:
             raise ServiceUnreachable(f"{url!r} is not an address: {error}") from error
 
@@ -174,6 +189,15 @@ class Client:
             raise UnexpectedAnswer(
                 f"{self._http.base_url} does not answer like AirMatrix: {method} {path}: {error.errors()[0]['msg']}"
             ) from error
+
+
+def authorization(token: str | None) -> dict[str, str]:
+    """Return the headers that a bearer token is sent in, none without one; raises `MalformedToken`."""
+    if token is None:
+        return {}
+    if not _TOKEN.fullmatch(token.strip()):
+        raise MalformedToken("the token has characters that no token has; give what `airmatrix token` prints")
+    return {"Authorization": f"Bearer {token.strip()}"}
 
 
 def grid_of(answer: AirspaceAnswer) -> AirMatrix:

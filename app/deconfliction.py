@@ -1,38 +1,37 @@
 """First come, first served (paper 2.4; domain: strategic deconfliction): what the writer does for operators.
 
-Each flight is planned in order of arrival against everything reserved before. The occupancy index that the planner
-reads is a replica of the ledger's reservations; only work in the writer's thread touches it.
+Each flight is planned in order of arrival against everything reserved before, but for those of lower priority that can
+still make way. Each method is one piece of the writer's work: all of it is durable when it returns, or nothing.
 """
 
 import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import structlog
 from uuid_utils import uuid7
 
-from app.errors import BeyondHorizon, DepartureInThePast, IdempotencyKeyReused, IllegalTransition, UnknownFlightIntent
-from app.flight_intents import OPEN_STATES, FlightIntent, Refusal, Reservations, State, Submission
+from app.constraints import Constraint
+from app.errors import (
+    IdempotencyKeyReused,
+    IllegalTransition,
+    NotChangeable,
+    PreconditionFailed,
+    TooManyOpenIntents,
+    UnknownConstraint,
+    UnknownFlightIntent,
+)
+from app.flight_intents import OPEN_STATES, Displacement, FlightIntent, Refusal, Reservations, State, Submission
 from app.ledger import Ledger, Transaction
-from app.surveillance import Aircraft
+from app.scheduling import Cause, Scheduler, details_of, refusal, reservations
+from app.surveillance import Aircraft, Sighting
 from app.times import format_time
 from app.writer import BatchReport, Writer
-from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import NoPlan
-from planner.occupancy import OccupancyIndex
 from planner.path import Plan, Trajectory
 
 log = structlog.get_logger()
-
-# The index forgets the past in steps of this length; forgetting looks at every block once.
-_FORGET_EVERY_MS = 10_000
-# A departure window may have opened before the intent came, but not longer ago than this.
-_OPEN_FOR_MS = 86_400_000
-# A process that lags further behind than this many journal entries loads the ledger afresh.
-_CATCH_UP_ENTRIES = 5_000
-_STATES = frozenset(State)
 
 
 @dataclass(frozen=True)
@@ -60,12 +59,22 @@ class Moved:
     flights: Sequence[tuple[int, str, State]]
 
 
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Flight intents that were recorded at once; `is_replayed` if that was before, and this a repetition."""
+
+    intents: Sequence[FlightIntent]
+    is_replayed: bool
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a submission. `replayed` is the body of the first answer, where this is a repetition; `rendered`
-    the body of this one, where it had to be made already."""
+    """What became of a submission or a change, and of the flights that had to make way for it. `replayed` is the body
+    of the first answer, where this is a repetition; `rendered` the body of this one, where it had to be made already.
+    """
 
     intent: FlightIntent
+    displaced: tuple[Displacement, ...] = ()
     replayed: bytes | None = None
     rendered: bytes | None = None
     timing: Timing = Timing()
@@ -73,71 +82,42 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class PreviewPlan:
-    """A plan that reserves nothing."""
+    """A plan that reserves nothing; `displaces` are the ids of the flights that would have to make way for it."""
 
     submission: Submission
     trajectory: Trajectory
     reservations: Reservations
+    displaces: tuple[str, ...]
 
 
-class OccupancyReplica:
-    """The occupancy index as a replica of the ledger's reservations."""
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """A constraint, the flights that had to make way for it, and the ids of those that no longer could."""
 
-    def __init__(self, index: OccupancyIndex) -> None:
-        self._index = index
-        self._forgotten_ms = 0
-
-    def __len__(self) -> int:
-        return len(self._index)
-
-    def catch_up(self, transaction: Transaction, now: int, revision: int | None) -> None:
-        """Bring the index from a revision (None: from nothing) to the transaction's; drop what has passed."""
-        index = self._index
-        # After a failover that lost commits, revisions are not what they were.
-        known = revision is not None and revision <= transaction.revision and not transaction.on_new_connection
-        lags = revision is not None and transaction.revision - revision > _CATCH_UP_ENTRIES
-        if revision is None or not known or lags or revision < transaction.journal_removed:
-            index.clear()
-            held = transaction.held_after(now)
-            index.reserve(held.block, held.enter_ms, held.exit_ms, held.sequence)
-            self._forgotten_ms = now
-            with suppress(OSError, ValueError):
-                log.info("index loaded", revision=transaction.revision, reservations=len(held.block))
-        elif transaction.revision > revision:
-            # What was remarked of aircraft changes no reservation.
-            entries = [entry for entry in transaction.journal_after(revision) if entry.kind in _STATES]
-            for entry in entries:
-                index.release(*entry.released.T.copy())
-            held = transaction.held_after(now, sorted({entry.sequence for entry in entries}))
-            index.release(held.block, held.enter_ms, held.exit_ms)
-            index.reserve(held.block, held.enter_ms, held.exit_ms, held.sequence)
-        transaction.seen()
-        if now - self._forgotten_ms >= _FORGET_EVERY_MS:
-            index.forget_before(now)
-            self._forgotten_ms = now
+    constraint: Constraint
+    displaced: tuple[Displacement, ...] = ()
+    unmoved: tuple[str, ...] = ()
 
 
 class Deconfliction:
-    """Plans, records and changes flights by way of the writer.
-
-    `horizon_ms` is how far ahead they may depart, `freshness_ms` for how long a position says where an aircraft is.
+    """Plans, records and changes flights by way of the writer. `freshness_ms`: for how long a position says where an
+    aircraft is.
     """
 
     def __init__(
         self,
         writer: Writer,
         ledger: Ledger,
-        planner: Planner,
-        performances: Mapping[str, Performance],
-        horizon_ms: int,
+        scheduler: Scheduler,
         freshness_ms: int,
+        open_intents_limit: int | None = None,
     ) -> None:
         self._writer = writer
         self._ledger = ledger
-        self._planner = planner
-        self._performances = performances
-        self._horizon_ms = horizon_ms
+        self._scheduler = scheduler
+        self._planner = scheduler.planner
         self._freshness_ms = freshness_ms
+        self._open_intents_limit = open_intents_limit
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to two blocks whatever the traffic. Safe in any thread."""
@@ -158,7 +138,7 @@ class Deconfliction:
         def look_up() -> Outcome | None:
             intent = self._ledger.find(intent_id)
             if intent is not None:
-                return Outcome(intent)
+                return Outcome(intent, self._made_way(intent))
             first = None if key is None else self._ledger.answer_to(submission.operator, key.key)
             if key is None or first is None or first.body_digest != key.body_digest:
                 return None
@@ -171,20 +151,107 @@ class Deconfliction:
         queue_s, plan_s = request.begun - request.arrived, request.ended - request.begun
         return replace(outcome, timing=Timing(queue_s, plan_s, time.perf_counter() - request.ended))
 
+    def _made_way(self, intent: FlightIntent) -> tuple[Displacement, ...]:
+        """Return who made way for an intent when it got its version, as the journal tells."""
+        entries = self._ledger.journal_after(intent.version - 1, 1)
+        return tuple(
+            Displacement(
+                entry.sequence,
+                entry.intent_id,
+                self._ledger.operator_of(entry.intent_id) or "",
+                State(entry.kind),
+                _ms_of(entry.details["departure_moved_s"]),
+                _ms_of(entry.details["arrival_moved_s"]),
+                entry.details["reason"],
+            )
+            for entry in entries
+            if entry.details.get("cause") == Cause(flight_intent_id=intent.id).member()
+        )
+
     async def preview(self, submission: Submission) -> PreviewPlan | Refusal:
         """Plan a submission, record nothing; raises as `submit`."""
 
         def run(transaction: Transaction, now: int) -> PreviewPlan | Refusal:
             try:
-                plan = self._plan(submission, now)
+                plan = self._scheduler.plan(transaction, now, submission)
             except NoPlan as error:
-                return _refusal(error, transaction)
-            return PreviewPlan(submission, plan, _reservations(plan))
+                return refusal(error, transaction)
+            ids = transaction.ids(self._scheduler.in_the_way(plan))
+            return PreviewPlan(submission, plan, reservations(plan), tuple(ids.values()))
 
         return await self._writer.perform(run, lambda: None, plans=True)
 
+    async def change(
+        self, intent_id: str, submission: Submission, versions: frozenset[int] | None
+    ) -> Outcome | Refusal:
+        """Plan an intent anew as it is submitted now, if it still has one of these versions (None: any).
+
+        One that is in the air goes on from where it will be soon. Where there is no plan, the refusal is returned, and
+        the old plan stands.
+
+        Raises
+        ------
+        UnknownFlightIntent, PreconditionFailed, IllegalTransition, NotChangeable, DepartureInThePast, BeyondHorizon,
+        NotPlannable, QueueFull, LedgerUnavailable, OutcomeUnknown
+            Nothing was changed.
+        """
+
+        def look_up() -> Outcome | Refusal | None:
+            intent = self._ledger.find(intent_id)
+            is_done = intent is not None and intent.submission == submission and intent.version not in (versions or ())
+            return Outcome(intent, self._made_way(intent)) if intent is not None and is_done else None
+
+        def run(transaction: Transaction, now: int) -> Outcome | Refusal:
+            return self._change(transaction, now, intent_id, submission, versions)
+
+        return await self._writer.perform(run, look_up, plans=True)
+
+    async def close(self, constraint: Constraint) -> Closed:
+        """Record a constraint, and plan those anew whom it hits and who can still make way.
+
+        Raises
+        ------
+        TooManyConstraints, QueueFull, LedgerUnavailable, OutcomeUnknown
+        """
+
+        # What the last attempt did, which is what was done if the constraint is in the ledger.
+        done: list[Closed] = []
+
+        def run(transaction: Transaction, now: int) -> Closed:
+            done[:] = [self._close(transaction, now, constraint)]
+            return done[0]
+
+        def look_up() -> Closed | None:
+            return done[0] if done and self._ledger.constraint(constraint.id) is not None else None
+
+        return await self._writer.perform(run, look_up)
+
+    async def reopen(self, constraint_id: str) -> Constraint:
+        """Remove a constraint. Who made way for it stays where it is now.
+
+        Raises
+        ------
+        UnknownConstraint, QueueFull, LedgerUnavailable, OutcomeUnknown
+        """
+
+        def run(transaction: Transaction, now: int) -> Constraint:
+            constraint = transaction.constraint(constraint_id)
+            if constraint is None:
+                raise UnknownConstraint(f"there is no constraint {constraint_id}")
+            if constraint.removed_ms is None:
+                constraint = transaction.remove_constraint(constraint, now)
+                self._scheduler.index.reopen([constraint.number])
+            return constraint
+
+        def look_up() -> Constraint | None:
+            constraint = self._ledger.constraint(constraint_id)
+            return constraint if constraint is not None and constraint.removed_ms is not None else None
+
+        return await self._writer.perform(run, look_up)
+
     async def cancel(self, intent_id: str) -> FlightIntent:
-        """Cancel an accepted intent. Before departure its reservations go, after it they stay until arrival.
+        """Cancel an intent that is accepted or displaced. Before departure its reservations go, after it they stay
+        until arrival.
 
         Raises
         ------
@@ -237,30 +304,6 @@ class Deconfliction:
             self._planner.index.reserve(kept.block, kept.enter_ms, kept.exit_ms, intent.sequence)
         return changed
 
-    def _plan(self, submission: Submission, now: int) -> Plan:
-        """Plan against the index; raises as `submit`, and `NoPlan`."""
-        if submission.latest_departure_ms < now:
-            raise DepartureInThePast(
-                f"the latest departure, {format_time(submission.latest_departure_ms)}, has passed; "
-                f"it is {format_time(now)}"
-            )
-        if submission.earliest_departure_ms < now - _OPEN_FOR_MS:
-            raise DepartureInThePast(
-                f"the earliest departure, {format_time(submission.earliest_departure_ms)}, is more than a day ago; "
-                f"it is {format_time(now)}"
-            )
-        horizon = now + self._horizon_ms
-        if submission.latest_departure_ms > horizon:
-            raise BeyondHorizon(f"flights can be planned to depart until {format_time(horizon)}; submit this one later")
-        request = PlanRequest(
-            submission.origin_block,
-            submission.destination_block,
-            self._performances[submission.aircraft_type],
-            max(submission.earliest_departure_ms, now),
-            submission.latest_departure_ms,
-        )
-        return self._planner.plan(request)
-
     def _submit(
         self, transaction: Transaction, now: int, intent_id: str, submission: Submission, key: IdempotencyKey | None
     ) -> Outcome:
@@ -273,31 +316,126 @@ class Deconfliction:
                 )
             if first is not None:
                 return Outcome(first.intent, replayed=first.answer)
-        refusal = plan = None
+        self.check_open_intents(transaction, submission.operator)
         try:
-            plan = self._plan(submission, now)
+            plan = self._scheduler.plan(transaction, now, submission)
         except NoPlan as error:
-            refusal = _refusal(error, transaction)
-        intent = transaction.record(
-            intent_id=intent_id,
-            submission=submission,
-            now_ms=now,
-            trajectory=plan,
-            reservations=None if plan is None else _reservations(plan),
-            refusal=refusal,
-        )
-        rendered = None
+            outcome = Outcome(
+                transaction.record(
+                    intent_id=intent_id, submission=submission, now_ms=now, refusal=refusal(error, transaction)
+                )
+            )
+        else:
+            outcome = self._accept(transaction, now, intent_id, submission, plan)
         if key is not None:
-            rendered = key.render(Outcome(intent))
-            transaction.remember_answer(submission.operator, key.key, key.body_digest, intent, rendered, now)
-        held = intent.reservations
-        self._planner.index.reserve(held.block, held.enter_ms, held.exit_ms, intent.sequence)
-        return Outcome(intent, rendered=rendered)
+            outcome = replace(outcome, rendered=key.render(outcome))
+            assert outcome.rendered is not None
+            transaction.remember_answer(
+                submission.operator, key.key, key.body_digest, outcome.intent, outcome.rendered, now
+            )
+        return outcome
+
+    def check_open_intents(self, transaction: Transaction, operator: str, more: int = 1) -> None:
+        """Raise `TooManyOpenIntents` if an operator may not have so many more flights that are not over."""
+        limit = self._open_intents_limit
+        if limit is not None and transaction.count_open(operator, limit) + more > limit:
+            raise TooManyOpenIntents(f"operator {operator!r} may have {limit} flight intents that are not over")
+
+    def _accept(
+        self, transaction: Transaction, now: int, intent_id: str, submission: Submission, plan: Plan
+    ) -> Outcome:
+        """Record a flight with its plan, and move those that are in its way."""
+        scheduler = self._scheduler
+        with transaction.one_revision():
+            vacated = scheduler.vacate(transaction, now, scheduler.in_the_way(plan))
+            intent = transaction.record(
+                intent_id=intent_id,
+                submission=submission,
+                now_ms=now,
+                trajectory=plan,
+                reservations=reservations(plan),
+            )
+            scheduler.reserve(intent)
+            return Outcome(intent, scheduler.settle(transaction, now, vacated, Cause(flight_intent_id=intent.id)))
+
+    def _change(
+        self,
+        transaction: Transaction,
+        now: int,
+        intent_id: str,
+        submission: Submission,
+        versions: frozenset[int] | None,
+    ) -> Outcome | Refusal:
+        scheduler = self._scheduler
+        before = _found(transaction, intent_id)
+        if versions is not None and before.version not in versions:
+            raise PreconditionFailed(
+                f"flight intent {intent_id} has version {before.version} by now; read it, and change that"
+            )
+        if before.submission.operator != submission.operator:
+            raise NotChangeable("a flight intent stays with its operator")
+        if before.state is State.DISPLACED:
+            self.check_open_intents(transaction, submission.operator)
+        is_on_ground = self._is_on_ground_for_change(transaction, now, before)
+        try:
+            if is_on_ground:
+                plan = scheduler.plan(transaction, now, submission, before)
+            else:
+                plan = scheduler.continued(transaction, now, submission, before)
+        except NoPlan as error:
+            return refusal(error, transaction)
+        after = replace(
+            before,
+            state=State.ACCEPTED if before.activated_ms is None else State.ACTIVATED,
+            submission=submission,
+            trajectory=plan,
+            reservations=reservations(plan),
+            refusal=None,
+        )
+        with transaction.one_revision():
+            vacated = scheduler.vacate(transaction, now, [before.sequence, *scheduler.in_the_way(plan, before)])
+            after = transaction.rewrite(before, after, now, details_of(before, after))
+            scheduler.reserve(after)
+            others = [intent for intent in vacated if intent.sequence != before.sequence]
+            return Outcome(after, scheduler.settle(transaction, now, others, Cause(flight_intent_id=after.id)))
+
+    def _is_on_ground_for_change(self, transaction: Transaction, now: int, intent: FlightIntent) -> bool:
+        """Tell whether a flight can be planned anew from its origin, False where that is from where it will be in the
+        air; raises `IllegalTransition` where neither is known to be so.
+        """
+        if intent.state is State.DISPLACED:
+            return True
+        if intent.state not in OPEN_STATES or intent.trajectory is None:
+            raise IllegalTransition(f"flight intent {intent.id} is {intent.state} and cannot be changed")
+        if self._is_down(transaction, now, intent, intent.trajectory):
+            seen = self._newest_sighting(transaction, intent)
+            if now >= intent.trajectory.departure_ms and self._block_of(seen) == intent.trajectory.block[-1]:
+                raise IllegalTransition(f"flight intent {intent.id} has landed; end it, and submit another")
+            return True
+        if intent.state is not State.ACTIVATED:
+            raise IllegalTransition(
+                f"flight intent {intent.id} is {intent.state} and may be in the air: it can be changed once it is "
+                "activated and conforms, or reported on the ground"
+            )
+        return False
+
+    def _close(self, transaction: Transaction, now: int, constraint: Constraint) -> Closed:
+        scheduler = self._scheduler
+        with transaction.one_revision():
+            recorded = transaction.record_constraint(constraint, now)
+            hit = scheduler.within(transaction, now, recorded.closure)
+            vacated = scheduler.vacate(transaction, now, hit.movable)
+            scheduler.index.close({recorded.number: recorded.closure})
+            displaced = scheduler.settle(transaction, now, vacated, Cause(constraint_id=recorded.id))
+        ids = transaction.ids(hit.unmovable)
+        return Closed(recorded, displaced, tuple(ids[sequence] for sequence in hit.unmovable))
 
     def _cancel(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
         intent = _found(transaction, intent_id)
         if intent.state is State.CANCELLED:
             return intent
+        if intent.state is State.DISPLACED:
+            return transaction.change(intent, State.CANCELLED, now)
         if intent.state is not State.ACCEPTED or intent.trajectory is None:
             raise IllegalTransition(f"flight intent {intent_id} is {intent.state} and cannot be cancelled")
         if intent.trajectory.arrival_ms < now:
@@ -311,14 +449,22 @@ class Deconfliction:
         """Tell whether a flight's aircraft is known not to be in the air: it should not have departed yet and was not
         seen flying; or it was reported on the ground, where it was to land, or just now.
         """
-        aircraft = Aircraft(intent.sequence)
-        seen = transaction.newest_positions([aircraft]).get(aircraft)
+        seen = self._newest_sighting(transaction, intent)
         if now < trajectory.departure_ms:
             return seen is None or seen.airborne is not True
         if seen is None or seen.airborne is not False or seen.time_ms < trajectory.departure_ms:
             return False
-        block = int(self._planner.airspace.grid.blocks_at(seen.lon, seen.lat, seen.alt_m)[0])
-        return block == trajectory.block[-1] or now - seen.time_ms <= self._freshness_ms
+        return self._block_of(seen) == trajectory.block[-1] or now - seen.time_ms <= self._freshness_ms
+
+    def _newest_sighting(self, transaction: Transaction, intent: FlightIntent) -> Sighting | None:
+        aircraft = Aircraft(intent.sequence)
+        return transaction.newest_positions([aircraft]).get(aircraft)
+
+    def _block_of(self, seen: Sighting | None) -> int | None:
+        """Return the block of a position, -1 outside the grid."""
+        if seen is None:
+            return None
+        return int(self._planner.airspace.grid.blocks_at(seen.lon, seen.lat, seen.alt_m)[0])
 
     def _activate(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
         intent = _found(transaction, intent_id)
@@ -343,16 +489,51 @@ def _found(transaction: Transaction, intent_id: str) -> FlightIntent:
     return intent
 
 
+def _ms_of(seconds: float | None) -> int | None:
+    return None if seconds is None else round(seconds * 1000)
+
+
 def log_intents(report: BatchReport) -> None:
     """Log each flight intent that a batch has recorded or changed."""
     for request, answer in zip(report.requests, report.answers, strict=True):
         if isinstance(answer, Outcome) and answer.replayed is None:
             _log_intent(answer.intent, request.context)
+            _log_displaced(answer.displaced, request.context)
+        elif isinstance(answer, Recorded) and not answer.is_replayed:
+            # One line: the writer has other things to do than to write hundreds.
+            log.info(
+                "flight intents recorded",
+                count=len(answer.intents),
+                accepted=sum(intent.refusal is None for intent in answer.intents),
+                first_sequence=answer.intents[0].sequence,
+                **request.context,
+            )
+        elif isinstance(answer, Closed):
+            log.info(
+                "constraint in force",
+                constraint=answer.constraint.id,
+                unmoved=len(answer.unmoved),
+                **request.context,
+            )
+            _log_displaced(answer.displaced, request.context)
         elif isinstance(answer, FlightIntent):
             _log_intent(answer, request.context)
         elif isinstance(answer, Moved):
             for sequence, intent_id, state in answer.flights:
                 log.info(f"flight intent {state}", flight_intent=intent_id, sequence=sequence)
+
+
+def _log_displaced(displaced: Sequence[Displacement], context: Mapping[str, object]) -> None:
+    for flight in displaced:
+        log.info(
+            "flight intent made way" if flight.reason is None else "flight intent displaced",
+            flight_intent=flight.id,
+            sequence=flight.sequence,
+            operator=flight.operator,
+            departure_moved_ms=flight.departure_moved_ms,
+            reason=flight.reason,
+            **context,
+        )
 
 
 def _log_intent(intent: FlightIntent, context: Mapping[str, object]) -> None:
@@ -364,18 +545,4 @@ def _log_intent(intent: FlightIntent, context: Mapping[str, object]) -> None:
         operator=intent.submission.operator,
         **reason,
         **context,
-    )
-
-
-def _reservations(plan: Plan) -> Reservations:
-    return Reservations(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
-
-
-def _refusal(error: NoPlan, transaction: Transaction) -> Refusal:
-    ids = transaction.ids(error.conflicting_owners)
-    return Refusal(
-        reason=error.reason,
-        detail=str(error),
-        conflicting_intents=tuple(ids[owner] for owner in error.conflicting_owners if owner in ids),
-        earliest_feasible_departure_ms=error.earliest_feasible_departure_ms,
     )

@@ -4,10 +4,18 @@ RequestError                 answered as a problem; `app.problems` maps every on
 ├── UnknownAircraftType      no profile of that id
 ├── DepartureInThePast       the whole departure window has passed
 ├── BeyondHorizon            departure later than plans are made
-├── PriorityNotSupported     priorities other than 0
 ├── UnknownFlightIntent      no intent of that id
+├── ItemRefused              an item of a batch, for which the whole batch is refused
 ├── UnknownBlock             no block of those indices
+├── UnknownConstraint        no constraint of that id
+├── TooManyConstraints       as many constraints are in force, or to come, as there may be
+├── UnknownWebhook           no webhook of that id
+├── WebhookRefused           deliveries do not go to this address
+├── TooManyWebhooks          the operator has as many as it may
 ├── IllegalTransition        the intent's state does not allow it
+├── NotChangeable            something that this change cannot change
+├── PreconditionRequired     a change without the version that it is about
+├── PreconditionFailed       the intent has changed since
 ├── IdempotencyKeyReused     the key came with another body before
 ├── PositionRefused          a position of a telemetry report
 │   ├── UnknownFlight        of no flight intent that there is
@@ -16,11 +24,22 @@ RequestError                 answered as a problem; `app.problems` maps every on
 │   ├── PositionOutOfOrder   not newer than what is known
 │   ├── PositionNotFinite    not a number, or infinite
 │   ├── PositionRemote       nowhere near the airspace
+│   ├── PositionNotAllowed   of a flight or a track, and the token's scopes are not for those
 │   └── InvalidPosition      not a position
 ├── TooManyPositions         more positions than a report may have
 ├── InvalidCursor            not a cursor of this list
 ├── BodyTooLarge             more bytes than allowed
 ├── MalformedRequest         not JSON, or not HTTP as it should be
+├── HeadTooLarge             a longer head, or more headers, than allowed
+├── RequestTimedOut          a request whose bytes do not come
+├── TooManyConnections       more connections are open than allowed
+├── TooManyStreams           more streams are open than allowed
+├── Unauthenticated          no token, or none that holds
+├── InsufficientScope        a token without the scope that this needs
+├── OperatorMismatch         another operator's name than the token's
+├── PriorityNotAllowed       a higher priority than the token allows
+├── TooManyRequests          more requests a second than an operator may make
+├── TooManyOpenIntents       more flights that are not over than an operator may have
 ├── HostNotAllowed           a Host header that is not loopback, while there is no authentication
 ├── QueueFull                more requests are waiting than allowed; nothing was taken
 ├── LedgerUnavailable        the ledger failed; nothing was recorded
@@ -35,6 +54,8 @@ StartupError                 the service or a command cannot start; the CLI prin
 ├── AirspaceMismatch         a ledger of another airspace
 └── UnsafeListening          listening beyond loopback without authentication
 """
+
+from collections.abc import Sequence
 
 
 class RequestError(Exception):
@@ -53,20 +74,57 @@ class BeyondHorizon(RequestError):
     """The departure lies further ahead than plans are made."""
 
 
-class PriorityNotSupported(RequestError):
-    """Only priority 0 exists."""
-
-
 class UnknownFlightIntent(RequestError):
     """No flight intent has this id."""
+
+
+class ItemRefused(RequestError):
+    """The item of a batch at `index` is refused for a `cause`, and with it the whole batch."""
+
+    def __init__(self, index: int, cause: Exception) -> None:
+        super().__init__(f"flight_intents[{index}]: {cause}")
+        self.index = index
+        self.cause = cause
 
 
 class UnknownBlock(RequestError):
     """The airspace has no such block."""
 
 
+class UnknownConstraint(RequestError):
+    """No constraint has this id."""
+
+
+class TooManyConstraints(RequestError):
+    """As many constraints are in force, or to come, as there may be."""
+
+
+class UnknownWebhook(RequestError):
+    """No webhook has this id."""
+
+
+class WebhookRefused(RequestError):
+    """Deliveries do not go to this address."""
+
+
+class TooManyWebhooks(RequestError):
+    """The operator has as many webhooks as it may have."""
+
+
 class IllegalTransition(RequestError):
     """The flight intent's state does not allow this."""
+
+
+class NotChangeable(RequestError):
+    """Something that cannot be changed in this intent, or not any more."""
+
+
+class PreconditionRequired(RequestError):
+    """A change has to say which version it is about."""
+
+
+class PreconditionFailed(RequestError):
+    """The intent has another version by now."""
 
 
 class IdempotencyKeyReused(RequestError):
@@ -101,6 +159,10 @@ class PositionRemote(PositionRefused):
     """The position lies nowhere near the airspace."""
 
 
+class PositionNotAllowed(PositionRefused):
+    """The token is for flights and the position of a track, or the other way round."""
+
+
 class InvalidPosition(PositionRefused):
     """Not a position."""
 
@@ -119,6 +181,62 @@ class BodyTooLarge(RequestError):
 
 class MalformedRequest(RequestError):
     """The request cannot be parsed."""
+
+
+class UnsupportedMediaType(RequestError):
+    """The body does not say that it is JSON."""
+
+
+class HeadTooLarge(RequestError):
+    """The request's head is longer, or has more headers, than allowed."""
+
+
+class RequestTimedOut(RequestError):
+    """The request did not arrive in time; its connection is closed."""
+
+
+class TooManyConnections(RequestError):
+    """This process has as many connections as it may; this one is closed."""
+
+
+class TooManyStreams(RequestError):
+    """This process has as many open streams as it may."""
+
+
+class Unauthenticated(RequestError):
+    """There is no token, or it `is_invalid`."""
+
+    def __init__(self, reason: str, *, is_invalid: bool = False) -> None:
+        super().__init__(reason)
+        self.is_invalid = is_invalid
+
+
+class InsufficientScope(RequestError):
+    """The token has none of the scopes that are `needed`."""
+
+    def __init__(self, reason: str, needed: Sequence[str] = ()) -> None:
+        super().__init__(reason)
+        self.needed = needed
+
+
+class OperatorMismatch(RequestError):
+    """The request names another operator than the token, which may not speak for that one."""
+
+
+class PriorityNotAllowed(RequestError):
+    """The token does not allow so high a priority."""
+
+
+class TooManyRequests(RequestError):
+    """The operator has to wait."""
+
+    def __init__(self, reason: str, retry_after_s: int = 1) -> None:
+        super().__init__(reason)
+        self.retry_after_s = retry_after_s
+
+
+class TooManyOpenIntents(RequestError):
+    """The operator has as many flight intents as it may have that are not over."""
 
 
 class HostNotAllowed(RequestError):

@@ -1,12 +1,13 @@
 """Flight intents as the service thinks of them: between the HTTP bodies and the ledger's rows."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 
 from planner.airmatrix import IntArray
 from planner.path import Trajectory
+from planner.submitted import SubmittedPath
 
 
 class State(StrEnum):
@@ -19,6 +20,7 @@ class State(StrEnum):
     NONCONFORMING = "nonconforming"
     CONTINGENT = "contingent"
     ENDED = "ended"
+    DISPLACED = "displaced"
 
 
 # In these a flight may be in the air, or go there.
@@ -36,7 +38,9 @@ class Position:
 
 @dataclass(frozen=True)
 class Submission:
-    """What an operator asks for, located: blocks are flat indices, times ms."""
+    """What an operator asks for, located: blocks are flat indices, times ms. With a `path` of its own it departs when
+    that does; planned again, as late as `latest_departure_ms`. The ledger does not keep the path.
+    """
 
     operator: str
     reference: str | None
@@ -48,6 +52,7 @@ class Submission:
     destination_block: int
     earliest_departure_ms: int
     latest_departure_ms: int
+    path: SubmittedPath | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,17 +95,31 @@ class HeldReservations:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a recorded intent has no plan; the conflicting intents are ids."""
+    """Why a recorded intent has no plan; the conflicting intents and constraints are ids."""
 
     reason: str
     detail: str
     conflicting_intents: tuple[str, ...] = ()
     earliest_feasible_departure_ms: int | None = None
+    conflicting_constraints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """What became of a flight that had to make way: how much later it departs and arrives (ms), or why it cannot."""
+
+    sequence: int
+    id: str
+    operator: str
+    state: State
+    departure_moved_ms: int | None = None
+    arrival_moved_ms: int | None = None
+    reason: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class FlightIntent:
-    """A recorded intent: accepted with a trajectory, or rejected with a refusal; every change has a new `version`."""
+    """A recorded intent, with a trajectory or, rejected or displaced, a refusal. Each change has a new `version`."""
 
     id: str
     sequence: int

@@ -6,16 +6,18 @@ from importlib.metadata import version
 from typing import Any, TypedDict
 
 from anyio import to_thread
-from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
+from fastapi import Depends, FastAPI
 from fastapi_offline import FastAPIOffline
 
-from app import problems, service
+from app import auth, openapi, problems, service
 from app.gate import Gate
 from app.routes import (
     aircraft_types,
     airspace,
+    batches,
     console,
+    constraints,
+    docs,
     events,
     flight_intents,
     flights,
@@ -24,7 +26,9 @@ from app.routes import (
     status,
     stream,
     telemetry,
+    webhooks,
 )
+from app.security_headers import SecurityHeaders
 from app.service import Service
 from app.settings import Settings
 from app.times import monotonic_ms, now_ms
@@ -37,9 +41,6 @@ against everything reserved before, and its blocks are reserved durably. Ops sta
 Times are RFC 3339 with an offset, answered in UTC with milliseconds. Errors are problem documents (RFC 9457). Every
 answer names its request in `X-Request-ID`, and so do the logs; send one (up to 100 of `A-Za-z0-9._:-`) to choose it.
 """
-
-
-_FASTAPI_VALIDATION = {"$ref": "#/components/schemas/HTTPValidationError"}
 
 
 class State(TypedDict):
@@ -70,26 +71,32 @@ def create_app(
         finally:
             await to_thread.run_sync(starting.__exit__, None, None, None)
 
-    # Its documentation page needs no other server than this one.
+    # Its documentation page, which is ours, needs no other server than this one.
     app = FastAPIOffline(
         title="AirMatrix",
         version=version("airmatrix"),
         description=DESCRIPTION,
         lifespan=lifespan,
+        docs_url=None,
         redoc_url=None,
+        dependencies=[Depends(auth.admitted)],
     )
     for resource in (
         flight_intents,
+        batches,
         telemetry,
         aircraft_types,
         airspace,
         status,
+        constraints,
         flights,
         stream,
         events,
+        webhooks,
         health,
         metrics,
         console,
+        docs,
     ):
         app.include_router(resource.router)
     app.include_router(problems.router)
@@ -97,24 +104,12 @@ def create_app(
     app.add_middleware(Gate, settings=settings)
     inner = app.build_middleware_stack
     # Outside of the middleware that answers unexpected errors, where `add_middleware` cannot put it.
-    app.build_middleware_stack = lambda: Tracing(inner())  # type: ignore[method-assign]
+    app.build_middleware_stack = lambda: Tracing(SecurityHeaders(inner()))  # type: ignore[method-assign]
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document, with problems under their own media type."""
     if app.openapi_schema is None:
-        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-        problem = {"$ref": "#/components/schemas/Problem"}
-        for path in document["paths"].values():
-            for operation in path.values():
-                for answer in operation["responses"].values():
-                    content = answer.get("content", {})
-                    if content.get("application/json", {}).get("schema") in (problem, _FASTAPI_VALIDATION):
-                        del content["application/json"]
-                        content[problems.MEDIA_TYPE] = {"schema": problem}
-        for unused in ("HTTPValidationError", "ValidationError"):
-            document["components"]["schemas"].pop(unused, None)
-        app.openapi_schema = document
+        app.openapi_schema = openapi.document(app)
     return app.openapi_schema

@@ -18,12 +18,13 @@ from prometheus_client import (
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 
 from app import problems
-from app.deconfliction import Moved, Outcome, PreviewPlan
+from app.deconfliction import Moved, Outcome, PreviewPlan, Recorded
 from app.errors import PositionRefused
 from app.flight_intents import FlightIntent, Refusal, State
 from app.ledger import CommitUncertain
+from app.webhook_delivery import OUTCOMES
 from app.writer import BATCH_REQUESTS, BatchReport
-from planner.errors import NoPlan, NotPlannable
+from planner.errors import NoPlan, NotPlannable, PathRefused
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 # Paths without a route of the API, and methods that HTTP does not know: any client can think of more.
@@ -46,9 +47,15 @@ _POSITIONS = (
     ),
 )
 _COMMIT_UNCERTAIN, _BATCH_FAILED = "commit_uncertain", "batch_failed"
-_REASONS = {
-    problems.KINDS[base].slug: [error.reason for error in base.__subclasses__()] for base in (NotPlannable, NoPlan)
-}
+
+
+def _reasons(base: type[NotPlannable] | type[PathRefused] | type[NoPlan]) -> set[str]:
+    """Return the reasons of all errors of a kind, but for those that are a kind of their own."""
+    own = {base.reason} if "reason" in vars(base) else set()
+    return own.union(*(_reasons(error) for error in base.__subclasses__() if error not in problems.KINDS))
+
+
+_REASONS = {problems.KINDS[base].slug: sorted(_reasons(base)) for base in (NotPlannable, PathRefused, NoPlan)}
 
 # Without this, every counter has a twin with the time of its creation.
 disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -112,6 +119,12 @@ class Metrics:
             registry=registry,
         )
         self._monitor_seconds = _seconds("monitor", "A look at all that is in the air, with what it records.", registry)
+        self._webhook_deliveries = Counter(
+            "airmatrix_webhook_deliveries_total",
+            "Attempts to deliver an event to a webhook, by outcome.",
+            ["outcome"],
+            registry=registry,
+        )
         self._ledger_failures = Counter(
             "airmatrix_ledger_failures_total", "Batches that failed, by how.", ["kind"], registry=registry
         )
@@ -121,6 +134,8 @@ class Metrics:
             self._ledger_failures.labels(kind)
         for outcome in _POSITIONS:
             self._positions.labels(outcome)
+        for outcome in OUTCOMES:
+            self._webhook_deliveries.labels(outcome)
         for state in _MOVES:
             self._moves.labels(state.value)
         for slug, reason in _kinds_of_problems():
@@ -164,15 +179,19 @@ class Metrics:
             if isinstance(answer, Moved):
                 for _, _, state in answer.flights:
                     self._moves.labels(state.value).inc()
-            outcome = _outcome(answer)
-            if outcome is not None:
-                self._flight_intents.labels(outcome).inc()
+            for outcome in map(_outcome, answer.intents if isinstance(answer, Recorded) else [answer]):
+                if outcome is not None:
+                    self._flight_intents.labels(outcome).inc()
 
     def positions(self, refused: Iterable[PositionRefused], accepted: int) -> None:
         """Take down what became of reported positions."""
         self._positions.labels(_ACCEPTED).inc(accepted)
         for error in refused:
             self._positions.labels(problems.kind_of(error).slug).inc()
+
+    def webhook(self, outcome: str) -> None:
+        """Count an attempt to deliver an event."""
+        self._webhook_deliveries.labels(outcome).inc()
 
     def looked(self, seconds: float) -> None:
         """Take down how long a look at the air took."""
@@ -211,7 +230,7 @@ def _outcome(answer: object) -> str | None:
             return "rejected"
         case Outcome():
             return "accepted"
-        case FlightIntent(state=State.CANCELLED | State.ENDED as state):
+        case FlightIntent(state=State.CANCELLED | State.ENDED | State.ACCEPTED | State.REJECTED as state):
             return state.value
         case FlightIntent():
             return State.ACTIVATED.value

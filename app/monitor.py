@@ -12,7 +12,7 @@ from functools import partial
 import structlog
 
 from app.alerts import Alert, alerts
-from app.block_status import BlockStatus, statuses
+from app.block_status import Alarm, BlockStatus, statuses
 from app.conformance import Assessment, Conformance, Thresholds, assess, move
 from app.deconfliction import Deconfliction, Moved
 from app.errors import IllegalTransition, LedgerUnavailable, QueueFull
@@ -127,11 +127,14 @@ class Monitor:
         return View(now, picture, assessed, blocks)
 
     def alerts(self, view: View) -> list[Alert]:
-        """Return who deviates in a view of the present, and whom they threaten; raises `LedgerUnavailable`."""
+        """Return who deviates in a view of the present, whom they threaten, and who is in closed airspace; raises
+        `LedgerUnavailable`.
+        """
         deviating = [
             (assessment, view.at_ms if remark is None else remark.raised_ms)
             for aircraft, assessment in view.assessed.items()
-            if assessment.reasons
+            # Who is in closed airspace as it was planned is to be seen too; other red blocks have somebody to blame.
+            if assessment.reasons or Alarm.IN_CONSTRAINT in assessment.alarms
             for remark in [view.picture.remarks.get(aircraft)]
         ]
         return alerts(deviating, self._airspace.grid, view.at_ms, self._thresholds, self._ledger.held_in)

@@ -13,10 +13,11 @@ from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from app import errors
+from app import auth, errors
 from app.flight_intents import FlightIntent, Refusal
 from app.times import format_time
-from planner.errors import AircraftProfileError, NoPlan, NotPlannable
+from planner.errors import AircraftProfileError, NoPlan, NotPlannable, PathRefused, VolumeError
+from planner.submitted import PathConflicts
 
 log = structlog.get_logger()
 
@@ -38,12 +39,20 @@ KINDS: dict[type[Exception], Kind] = {
         "not-plannable", 422, "No plan can exist for this request",
         "Change origin or destination; `reason` says which, `nearest_free_block` where to.",
     ),
+    PathRefused: Kind(
+        "path-refused", 422, "This path cannot be flown",
+        "Change the entry whose index is `entry`; `reason` says what is wrong with it.",
+    ),
     NoPlan: Kind(
         "no-conflict-free-plan", 409, "The present traffic leaves no plan",
         "Submit again with a later departure; `earliest_feasible_departure` is one that works now, where known.",
     ),
     AircraftProfileError: Kind(
         "aircraft-too-slow", 422, "The aircraft is too slow for this airspace", "Choose a faster aircraft type."
+    ),
+    PathConflicts: Kind(
+        "path-conflicts", 409, "Others are in the way of this path",
+        "Submit a path around `conflicts`, or what `proposal` flies, where there is one.",
     ),
     errors.UnknownAircraftType: Kind(
         "unknown-aircraft-type", 422, "Unknown aircraft type", "Choose one from /v1/aircraft-types."
@@ -54,17 +63,43 @@ KINDS: dict[type[Exception], Kind] = {
     errors.BeyondHorizon: Kind(
         "beyond-horizon", 422, "The departure is too far ahead", "Submit the flight intent nearer to its departure."
     ),
-    errors.PriorityNotSupported: Kind(
-        "priority-not-supported", 422, "Priorities are not supported", "Leave `priority` out or at 0."
-    ),
     errors.UnknownFlightIntent: Kind(
         "unknown-flight-intent", 404, "Unknown flight intent", "Check the id; /v1/flight-intents lists all."
     ),
     errors.UnknownBlock: Kind(
         "unknown-block", 404, "Unknown block", "Blocks are zero-based; `dimensions` in /v1/airspace bounds them."
     ),
+    errors.UnknownConstraint: Kind(
+        "unknown-constraint", 404, "Unknown constraint", "Check the id; /v1/constraints lists those in force."
+    ),
+    errors.TooManyConstraints: Kind(
+        "too-many-constraints", 409, "Too many constraints", "Remove some, or close one larger volume instead."
+    ),
+    VolumeError: Kind(
+        "invalid-volume", 422, "Not a volume of this airspace",
+        "Send a valid polygon in degrees, and altitudes, that reach into the airspace.",
+    ),
+    errors.UnknownWebhook: Kind("unknown-webhook", 404, "Unknown webhook", "Check the id; /v1/webhooks lists yours."),
+    errors.WebhookRefused: Kind(
+        "webhook-refused", 422, "Nothing is delivered to this address", "Give an https url of a public host."
+    ),
+    errors.TooManyWebhooks: Kind("too-many-webhooks", 409, "Too many webhooks", "Remove one that is not needed."),
+    errors.ItemRefused: Kind(
+        "item-refused", 422, "An item of the batch is refused, and the batch with it",
+        "Nothing was recorded. `cause` says what is wrong with the item at `index`; correct or leave it out.",
+    ),
     errors.IllegalTransition: Kind(
         "illegal-transition", 409, "The flight intent's state does not allow this", "Read the intent's state first."
+    ),
+    errors.NotChangeable: Kind(
+        "not-changeable", 422, "This cannot be changed", "Leave it as it is, or cancel the intent and submit another."
+    ),
+    errors.PreconditionRequired: Kind(
+        "precondition-required", 428, "Which version is to be changed?",
+        "Send the `ETag` of the flight intent that you read as `If-Match`.",
+    ),
+    errors.PreconditionFailed: Kind(
+        "precondition-failed", 412, "The flight intent has changed since", "Read it again, and change what it is now."
     ),
     errors.IdempotencyKeyReused: Kind(
         "idempotency-key-reused", 422, "Idempotency key used with another body", "Use a new key for a new request."
@@ -90,6 +125,10 @@ KINDS: dict[type[Exception], Kind] = {
     errors.PositionRemote: Kind(
         "position-remote", 422, "Position nowhere near the airspace", "Report positions of this airspace only."
     ),
+    errors.PositionNotAllowed: Kind(
+        "position-not-allowed", 403, "Not yours to report",
+        "Flights need the scope airmatrix.plan, tracks airmatrix.surveillance.",
+    ),
     errors.TooManyPositions: Kind(
         "too-many-positions", 413, "Too many positions", "Split the report."
     ),
@@ -97,7 +136,41 @@ KINDS: dict[type[Exception], Kind] = {
         "invalid-cursor", 422, "Invalid cursor", "Pass `next_cursor` as it came, or leave it out to start again."
     ),
     errors.BodyTooLarge: Kind("body-too-large", 413, "The body is too large", "Send fewer bytes."),
+    errors.HeadTooLarge: Kind(
+        "head-too-large", 431, "The request's head is too large", "Send fewer and shorter headers."
+    ),
+    errors.RequestTimedOut: Kind(
+        "request-timeout", 408, "The request did not arrive in time", "Send it again, the whole of it at once."
+    ),
+    errors.TooManyConnections: Kind(
+        "too-many-connections", 503, "Too many connections are open",
+        "Wait `Retry-After` seconds; use fewer connections.",
+    ),
+    errors.TooManyStreams: Kind(
+        "too-many-streams", 503, "Too many streams are open", "Read /v1/airspace/status, or ask another server."
+    ),
+    errors.UnsupportedMediaType: Kind(
+        "unsupported-media-type", 415, "The body is not said to be JSON", "Send `Content-Type: application/json`."
+    ),
     errors.MalformedRequest: Kind("malformed-request", 400, "Malformed request", "Send a JSON document."),
+    errors.Unauthenticated: Kind(
+        "unauthenticated", 401, "No valid token", "Send `Authorization: Bearer <token>` with a token that is valid now."
+    ),
+    errors.InsufficientScope: Kind(
+        "insufficient-scope", 403, "The token lacks a scope", "Ask for a token with one of `needed_scopes`."
+    ),
+    errors.OperatorMismatch: Kind(
+        "operator-mismatch", 403, "Another operator than the token's", "Leave `operator` out, or name the token's."
+    ),
+    errors.PriorityNotAllowed: Kind(
+        "priority-not-allowed", 403, "The token does not allow this priority",
+        "Ask for a lower priority, or for a token with a higher `airmatrix_max_priority`.",
+    ),
+    errors.TooManyRequests: Kind("too-many-requests", 429, "Too many requests", "Wait `Retry-After` seconds."),
+    errors.TooManyOpenIntents: Kind(
+        "too-many-open-intents", 429, "Too many flight intents that are not over",
+        "Wait until flights have ended, or cancel some.",
+    ),
     errors.HostNotAllowed: Kind(
         "host-not-allowed", 421, "Host not served here",
         "Without authentication only loopback hosts are answered; use 127.0.0.1 or localhost.",
@@ -124,6 +197,10 @@ HTTP_ERRORS = {
 INTERNAL = Kind("internal-error", 500, "Internal error", "Report `error_id`; the log has the details.")
 
 
+# What a body of several forms is told apart by stands in the place of an error like a member; it is none.
+FORMS = (":planned", ":trajectory", ":volumes")
+
+
 class Problem(BaseModel):
     """An RFC 9457 problem document; kinds of problems add members."""
 
@@ -144,10 +221,15 @@ class KindAnswer(BaseModel):
     advice: str
 
 
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return what OpenAPI says of a route's problems."""
+    return {status: {"model": Problem, "description": "A problem (RFC 9457)"} for status in (*statuses, 500)}
+
+
 router = APIRouter(prefix="/problems", tags=["running it"])
 
 
-@router.get("/{slug}", summary="Explain a kind of problem")
+@router.get("/{slug}", responses=documented(404), summary="Explain a kind of problem")
 async def explain(slug: str) -> KindAnswer:
     """Say what a problem of this type means and what to do about it."""
     for kind in (*KINDS.values(), *HTTP_ERRORS.values(), VALIDATION, INTERNAL):
@@ -186,24 +268,51 @@ def response_to(error: Exception) -> Response:
         members["reason"] = error.reason
         if error.nearest_free_block is not None:
             members["nearest_free_block"] = error.nearest_free_block
+    if isinstance(error, PathRefused):
+        members |= {"reason": error.reason, "entry": error.entry}
     if isinstance(error, NoPlan):
         members["reason"] = error.reason
         if error.earliest_feasible_departure_ms is not None:
             members["earliest_feasible_departure"] = format_time(error.earliest_feasible_departure_ms)
     if isinstance(error, errors.NotReady):
         members |= {"reason": error.reason, "waiting": error.waiting, "revision": error.revision}
-    headers = {"Retry-After": "1"} if kind_of(error).status == 503 else None
-    return response(kind_of(error), str(error), members, headers)
+    if isinstance(error, errors.InsufficientScope):
+        members["needed_scopes"] = error.needed
+    if isinstance(error, errors.ItemRefused):
+        members |= {"index": error.index, "cause": orjson.Fragment(response_to(error.cause).body)}
+    return response(kind_of(error), str(error), members, _headers(error))
 
 
-def refusal_body(refusal: Refusal, intent: FlightIntent | None = None) -> bytes:
-    """Return the problem document of a refusal, with the intent under which it is recorded, if it is."""
+def _headers(error: Exception) -> dict[str, str]:
+    if isinstance(error, errors.Unauthenticated):
+        return {"WWW-Authenticate": 'Bearer error="invalid_token"' if error.is_invalid else "Bearer"}
+    if isinstance(error, errors.InsufficientScope):
+        return {"WWW-Authenticate": f'Bearer error="insufficient_scope", scope="{" ".join(error.needed)}"'}
+    if isinstance(error, errors.TooManyRequests):
+        return {"Retry-After": str(error.retry_after_s)}
+    return {"Retry-After": "1"} if kind_of(error).status == 503 else {}
+
+
+def refusal_body(
+    refusal: Refusal,
+    intent: FlightIntent | None = None,
+    stands: str | None = None,
+    more: Mapping[str, Any] | None = None,
+) -> bytes:
+    """Return the problem document of a refusal, with the intent under which it is recorded, if it is, or the id of the
+    one whose old plan stands; `more` are members that only its kind has.
+    """
     members: dict[str, Any] = {"reason": refusal.reason, "conflicting_intents": refusal.conflicting_intents}
+    if refusal.conflicting_constraints:
+        members["conflicting_constraints"] = refusal.conflicting_constraints
     if intent is not None:
         members |= {"flight_intent_id": intent.id, "sequence": intent.sequence}
+    if stands is not None:
+        members["flight_intent_id"] = stands
     if refusal.earliest_feasible_departure_ms is not None:
         members["earliest_feasible_departure"] = format_time(refusal.earliest_feasible_departure_ms)
-    return body(KINDS[NoPlan], refusal.detail, members)
+    kind = PathConflicts if refusal.reason == PathConflicts.reason else NoPlan
+    return body(KINDS[kind], refusal.detail, members | dict(more or {}))
 
 
 def install(app: FastAPI) -> None:
@@ -215,7 +324,11 @@ def install(app: FastAPI) -> None:
     async def validation_error(_: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         found = [
-            {"loc": list(item["loc"]), "msg": item["msg"].removeprefix("Value error, "), "type": item["type"]}
+            {
+                "loc": [part for part in item["loc"] if part not in FORMS],
+                "msg": item["msg"].removeprefix("Value error, "),
+                "type": item["type"],
+            }
             for item in error.errors()
         ]
         if any(item["type"] == "json_invalid" for item in found):
@@ -224,13 +337,18 @@ def install(app: FastAPI) -> None:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
         return response(VALIDATION, first + more, {"errors": found})
 
-    async def http_error(_: Request, error: Exception) -> Response:
+    async def http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         if error.status_code == 400:
             return response(KINDS[errors.MalformedRequest], "the body cannot be parsed")
         known = HTTP_ERRORS.get(error.status_code)
         if known is not None:
-            return response(known, known.advice, headers=error.headers)
+            headers = dict(error.headers or {})
+            if known.status == 405:
+                # The framework names those of one route that has the path: not all, or those of another's pattern.
+                head = {"HEAD"}.intersection(headers.get("Allow", "").split(", "))
+                headers["Allow"] = ", ".join(sorted(auth.methods_at(request.url.path) | head))
+            return response(known, known.advice, headers=headers)
         # What the framework refuses for reasons of its own is malformed to us, under the framework's status.
         malformed = replace(KINDS[errors.MalformedRequest], status=error.status_code)
         return response(malformed, str(error.detail), headers=error.headers)
@@ -245,8 +363,3 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, validation_error)
     app.add_exception_handler(HTTPException, http_error)
     app.add_exception_handler(Exception, unexpected_error)
-
-
-def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return what OpenAPI says of a route's problems."""
-    return {status: {"model": Problem, "description": "A problem (RFC 9457)"} for status in (*statuses, 500)}

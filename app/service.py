@@ -14,16 +14,22 @@ import structlog
 from fastapi import Depends, Request
 
 from app import auth
+from app.batches import Batches
 from app.conformance import Thresholds
-from app.deconfliction import Deconfliction, OccupancyReplica, log_intents
+from app.deconfliction import Deconfliction, log_intents
 from app.errors import ReadOnlyServer, StartupError
+from app.keys import store_of
 from app.ledger import Ledger, create_or_upgrade, open_ledger
 from app.ledger_probe import LedgerProbe
 from app.metrics import Metrics
 from app.monitor import Monitor
+from app.replica import OccupancyReplica
+from app.scheduling import Periods, Scheduler
 from app.settings import Settings
 from app.telemetry import Telemetry
 from app.times import monotonic_ms
+from app.webhook_delivery import Deliverer, Post
+from app.webhooks import Destinations, Webhooks
 from app.writer import Policy, Writer
 from planner.aircraft import AircraftType, merged, read_aircraft_types, shipped_aircraft_types
 from planner.airspace import Airspace, read_airspace
@@ -58,7 +64,10 @@ class Writing:
 
     writer: Writer
     deconfliction: Deconfliction
+    batches: Batches
     telemetry: Telemetry
+    webhooks: Webhooks
+    deliverer: Deliverer
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,7 @@ class Service:
     clock: Callable[[], int]
     metrics: Metrics
     probe: LedgerProbe
+    access: auth.Access
     monitor: Monitor
     # Set when the server goes down: streams must not hold it up.
     closing: threading.Event
@@ -93,9 +103,19 @@ class Service:
         return self._writing().deconfliction
 
     @property
+    def batches(self) -> Batches:
+        """What plans and records batches; raises `ReadOnlyServer` where nothing does."""
+        return self._writing().batches
+
+    @property
     def telemetry(self) -> Telemetry:
         """What takes positions; raises `ReadOnlyServer` where nothing does."""
         return self._writing().telemetry
+
+    @property
+    def webhooks(self) -> Webhooks:
+        """What adds and removes webhooks; raises `ReadOnlyServer` where nothing does."""
+        return self._writing().webhooks
 
     def _writing(self) -> Writing:
         if self.writing is None:
@@ -145,6 +165,7 @@ def prepare(settings: Settings) -> Basis:
         A file is missing, foreign or does not fit.
     """
     auth.check_listening(settings)
+    store_of(settings)
     basis = read_basis(settings)
     airspace = basis.airspace
     log.info(
@@ -182,7 +203,7 @@ def started(
         The ledger has changed since it was prepared, or fails; nothing is left running.
     """
     settings, airspace = basis.settings, basis.airspace
-    with closing(open_ledger(settings.ledger, airspace)) as ledger:
+    with auth.access(settings, elapsed_ms) as access, closing(open_ledger(settings.ledger, airspace)) as ledger:
         # Opening the projection takes as long as a hundred plans: not in the first request.
         airspace.grid.project(*airspace.grid.bounds[:2])
         metrics = Metrics()
@@ -208,12 +229,14 @@ def started(
                 clock=clock,
                 metrics=metrics,
                 probe=LedgerProbe(ledger),
+                access=access,
                 monitor=monitor,
                 closing=threading.Event(),
             )
         finally:
             monitor.stop()
             if writing is not None:
+                writing.deliverer.stop()
                 writing.writer.stop()
 
 
@@ -252,9 +275,15 @@ def _writing(
         observers=(log_intents, metrics.batch),
         on_death=on_death,
     )
-    horizon_ms = int(settings.horizon_days * 86_400_000)
-    freshness_ms = _thresholds(settings).freshness_ms
-    deconfliction = Deconfliction(writer, ledger, planner, basis.performances(), horizon_ms, freshness_ms)
+    periods = Periods(
+        horizon_ms=int(settings.horizon_days * 86_400_000),
+        notice_ms=int(settings.notice_s * 1000),
+        lead_ms=int(settings.replan_lead_s * 1000),
+    )
+    scheduler = Scheduler(planner, basis.performances(), periods)
+    deconfliction = Deconfliction(
+        writer, ledger, scheduler, _thresholds(settings).freshness_ms, settings.open_intents_limit
+    )
     telemetry = Telemetry(
         ledger,
         writer,
@@ -263,9 +292,13 @@ def _writing(
         ahead_ms=int(settings.tolerance_s * 1000),
         kept_ms=policy.positions_ms,
     )
+    destinations = Destinations.of(settings)
+    deliverer = Deliverer(ledger, writer, clock, Post(destinations), metrics.webhook)
     writer.start()
+    deliverer.start()
     metrics.index_loaded(len(planner.index))
-    return Writing(writer, deconfliction, telemetry)
+    batches = Batches(writer, ledger, scheduler, deconfliction)
+    return Writing(writer, deconfliction, batches, telemetry, Webhooks(ledger, writer, destinations), deliverer)
 
 
 async def of_request(request: Request) -> Service:

@@ -1,9 +1,10 @@
 """Every setting of the service, in one object that is passed in. Each is also an ``AIRMATRIX_*`` variable."""
 
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.times import Timestamp, parse_time
@@ -15,6 +16,16 @@ _LONGEST_S = 86_400.0
 _SHORTEST_RETENTION_DAYS = 1 / 24
 # Even the fastest clock takes years from there to the last year that can be named.
 _LATEST_CLOCK_START_MS = parse_time("2999-12-31T23:59:59.999Z")
+
+
+def _proxies(text: str) -> str:
+    """Check that these are addresses and networks; a name, or `*` for everybody, is none."""
+    for part in text.split(",") if text else ():
+        ip_network(part.strip())
+    return text
+
+
+Proxies = Annotated[str, AfterValidator(_proxies)]
 
 
 class Settings(BaseSettings):
@@ -33,6 +44,10 @@ class Settings(BaseSettings):
     search: Search = Search.SAFE_INTERVAL
     hover_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 60.0
     ground_hold_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 300.0
+    # So long before its departure a flight is no longer moved for others.
+    notice_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 60.0
+    # From so soon on a flight in the air can be planned anew.
+    replan_lead_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     horizon_days: Annotated[float, Field(gt=0, le=60)] = 30.0
     idempotency_hours: Annotated[float, Field(gt=0, le=24 * 365)] = 24.0
     # Without it, nothing is ever removed.
@@ -56,8 +71,36 @@ class Settings(BaseSettings):
     queue_limit: Annotated[int, Field(ge=1)] = 1024
     max_body_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
     max_telemetry_bytes: Annotated[int, Field(ge=1024)] = 2 * 1024 * 1024
+    max_batch_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
 
+    # How long a request's head may take to arrive, and then its body; and how soon some of an answer must be read.
+    head_timeout_s: Annotated[float, Field(gt=0, le=3_600)] = 10.0
+    body_timeout_s: Annotated[float, Field(gt=0, le=3_600)] = 10.0
+    send_timeout_s: Annotated[float, Field(gt=0, le=3_600)] = 10.0
+    # Of one process.
+    max_connections: Annotated[int, Field(ge=1, le=100_000)] = 1_000
+    max_streams: Annotated[int, Field(ge=1, le=100_000)] = 200
+    # Addresses or networks, with commas between them, that say for whom and by which protocol they ask.
+    trusted_proxies: Proxies = ""
+
+    # Where the public keys of tokens are: a file's path or an address. Without it there is no authentication.
+    jwks: Annotated[str, Field(min_length=1)] | None = None
+    audience: Annotated[str, Field(min_length=1)] = "airmatrix"
+    issuer: Annotated[str, Field(min_length=1)] | None = None
+    # How often an address is asked for keys; a file is read again when it changes.
+    jwks_refresh_s: Annotated[float, Field(ge=1, le=_LONGEST_S)] = 300.0
+    # How far the clocks of issuers may be off.
+    leeway_s: Annotated[float, Field(ge=0, le=300)] = 5.0
     allow_unauthenticated: bool = False
+
+    # Of each operator: requests that plan or change flight intents, by each process; flight intents that are not over.
+    rate_per_s: Annotated[float, Field(gt=0, le=1_000_000)] | None = None
+    rate_burst: Annotated[int, Field(ge=1, le=1_000_000)] = 20
+    open_intents_limit: Annotated[int, Field(ge=1)] | None = None
+
+    # Whether webhooks may lead to addresses that are not public.
+    webhook_allow_private: bool = False
+
     log_format: Literal["console", "json"] = "console"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
 

@@ -1,9 +1,10 @@
 """What is known of the air at one time: flights, where aircraft were seen, what is reserved. Plain data."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from app.constraints import Constraint
 from app.flight_intents import HeldReservations, State
 
 
@@ -102,7 +103,8 @@ class Reach:
 
 @dataclass(frozen=True, eq=False)
 class AirPicture:
-    """The air at one time. `held` are the reservations from shortly before it until shortly after it.
+    """The air at one time. `held` are the reservations from shortly before it until shortly after it, `constraints`
+    those in force at it.
 
     Where `is_forecast`, no positions are known, for the time lies ahead or they are no longer kept: nobody is missed.
     """
@@ -113,3 +115,4 @@ class AirPicture:
     sightings: Mapping[Aircraft, Sighting] = field(default_factory=dict)
     remarks: Mapping[Aircraft, Remark] = field(default_factory=dict)
     is_forecast: bool = False
+    constraints: Sequence[Constraint] = ()

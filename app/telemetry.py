@@ -67,8 +67,8 @@ class Telemetry:
         self._ahead_ms = ahead_ms
         self._kept_ms = kept_ms
 
-    async def report(self, reports: Sequence[Report]) -> Receipt:
-        """Record positions, and return when they are durable.
+    async def report(self, reports: Sequence[Report], operator: str | None = None) -> Receipt:
+        """Record positions, of flights only an operator's own where one is given, and return when they are durable.
 
         What was recorded before is not recorded again, so a report may be repeated.
 
@@ -78,7 +78,7 @@ class Telemetry:
             Nothing is known to be recorded.
         """
         # No thread waits for the writer: there are only so many, and reads need them.
-        entries, known = await to_thread.run_sync(self._known, reports)
+        entries, known = await to_thread.run_sync(self._known, reports, operator)
         if known:
             stored = await self._writer.perform(
                 lambda transaction, now: self._store(transaction, now, known), lambda: None
@@ -88,12 +88,12 @@ class Telemetry:
         return Receipt(entries)
 
     def _known(
-        self, reports: Sequence[Report]
+        self, reports: Sequence[Report], operator: str | None
     ) -> tuple[list[PositionRefused | bool], list[tuple[int, Aircraft, Sighting]]]:
         """Return what is wrong with each position, and those with which nothing is by index, of whom and what."""
         entries = self._checked(reports)
         ids = [report.flight_intent_id for report in reports if report.flight_intent_id is not None]
-        sequences = self._ledger.sequences(ids)
+        sequences = self._ledger.sequences(ids, operator)
         known: list[tuple[int, Aircraft, Sighting]] = []
         for index, report in enumerate(reports):
             if isinstance(entries[index], PositionRefused):

@@ -518,6 +518,7 @@ class Writer:
             if self._policy.retention_ms is not None:
                 before_ms = self._surely(now) - self._policy.retention_ms
                 removed += transaction.remove_ended(before_ms, _REMOVE_INTENTS)
+                removed += transaction.forget_constraints(before_ms, _REMOVE_INTENTS)
                 removed += transaction.remove_journal(before_ms, _REMOVE_ENTRIES)
         if not removed:
             self._kept_house_ms = now

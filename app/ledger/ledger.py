@@ -3,21 +3,23 @@
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from sqlalchemy import Connection, and_, case, func, select
 from sqlalchemy.exc import DataError, DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
+from app.constraints import Constraint
 from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, HeldReservations, Reservations, State
-from app.ledger import positions, queries
+from app.ledger import constraints, positions, queries
 from app.ledger.database import Database
 from app.ledger.queries import IdempotencyRecord, JournalEntry
 from app.ledger.rows import by_intent, to_held, to_intent
 from app.ledger.tables import counters, flight_intents, reservations
 from app.ledger.transaction import ConstraintViolated, Transaction, cause_of
+from app.ledger.webhooks import WebhookRows
 from app.surveillance import AirPicture, Reach
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
@@ -46,6 +48,7 @@ class Ledger:
         self._reader = database.engine(writes=False)
         self._database = database
         self._airspace = airspace
+        self._known_constraints = constraints.KnownConstraints()
 
     def close(self) -> None:
         """Release all connections."""
@@ -187,19 +190,41 @@ class Ledger:
     def air_picture(self, at_ms: int, reach: Reach, *, is_past: bool, is_forecast: bool) -> AirPicture:
         """Return what is known of the air at a time: of the past as recorded, of the future as reserved."""
         with self._reading() as connection:
-            return positions.air_picture(
+            picture = positions.air_picture(
                 connection, self._airspace.grid, at_ms, reach, is_past=is_past, is_forecast=is_forecast
             )
+            return replace(picture, constraints=self._known_constraints.in_force(connection, at_ms))
+
+    def constraint(self, constraint_id: str) -> Constraint | None:
+        """Return a constraint, also one that has ended or was removed; None if there is none."""
+        with self._reading() as connection:
+            return constraints.find(connection, constraint_id)
+
+    def constraints_after(self, time_ms: int, *, number: int, limit: int) -> list[Constraint]:
+        """Return up to `limit` constraints that are in force after a time, by number, those beyond `number`."""
+        with self._reading() as connection:
+            return constraints.after(connection, time_ms, number=number, limit=limit)
+
+    def constraints_at(self, time_ms: int) -> tuple[Constraint, ...]:
+        """Return the constraints in force at a time, also those that were removed since, by number."""
+        with self._reading() as connection:
+            return self._known_constraints.in_force(connection, time_ms)
 
     def unseen(self, before_ms: int, limit: int) -> int:
         """Return how many flights, up to `limit`, should have arrived before a time and were never seen."""
         with self._reading() as connection:
             return len(positions.unseen(connection, before_ms, limit))
 
-    def sequences(self, intent_ids: Iterable[str]) -> dict[str, int]:
-        """Return the sequence numbers of intents by their ids, without those that there are not."""
+    def sequences(self, intent_ids: Iterable[str], operator: str | None = None) -> dict[str, int]:
+        """Return the sequence numbers of intents, of all or of an operator's, by those ids that there are."""
         with self._reading() as connection:
-            return queries.sequences_of(connection, intent_ids)
+            return queries.sequences_of(connection, intent_ids, operator)
+
+    def operator_of(self, intent_id: str) -> str | None:
+        """Return whose an intent is, None if there is none."""
+        query = select(flight_intents.c.operator).where(flight_intents.c.id == intent_id)
+        with self._reading() as connection:
+            return connection.execute(query).scalar_one_or_none()
 
     def ids(self, sequences: Iterable[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
@@ -220,6 +245,12 @@ class Ledger:
         with self._reading() as connection:
             rows = np.array([tuple(row) for row in connection.execute(query)], dtype=np.int64).reshape(-1, 2)
         return rows[:, 0], rows[:, 1]
+
+    @contextmanager
+    def webhooks(self) -> Iterator[WebhookRows]:
+        """Read webhooks, as of one moment."""
+        with self._reading() as connection:
+            yield WebhookRows(connection)
 
     def journal_after(self, revision: int, limit: int) -> list[JournalEntry]:
         """Return up to `limit` journal entries after a revision, oldest first."""

@@ -25,8 +25,8 @@ from app.ledger.tables import (
 from app.surveillance import Aircraft, AirPicture, Flight, Path, Reach, Remark, Sighting, Velocity
 from planner.airmatrix import AirMatrix
 
-# As the index of these flights says it: SQLite compares conditions by their text.
-_OPEN = text("flight_intents.state IN ('accepted', 'activated', 'nonconforming', 'contingent')")
+# As the indices of these flights say it: SQLite compares conditions by their text.
+IS_OPEN = text("flight_intents.state IN ('accepted', 'activated', 'nonconforming', 'contingent')")
 
 # Both databases understand this.
 _UPSERT = text(
@@ -180,7 +180,7 @@ def unseen(connection: Connection, before_ms: int, limit: int) -> list[tuple[int
     """Return sequences and ids of up to `limit` flights that should have arrived before a time and were never seen."""
     flight = flight_intents.c
     seen = select(newest_positions.c.intent).where(newest_positions.c.intent == flight.sequence).exists()
-    query = select(flight.sequence, flight.id).where(_OPEN, flight.arrival < before_ms, ~seen)
+    query = select(flight.sequence, flight.id).where(IS_OPEN, flight.arrival < before_ms, ~seen)
     return [(row.sequence, row.id) for row in connection.execute(query.order_by(flight.arrival).limit(limit))]
 
 
@@ -204,10 +204,10 @@ def _due(connection: Connection, at_ms: int, due_before_ms: int) -> list[int]:
     # Bounded above too: all that is planned for later stands in the same index.
     latest_ms = due_before_ms + select(counters.c.longest_flight).scalar_subquery()
     flying = select(flight.sequence).where(
-        _OPEN, flight.arrival >= at_ms, flight.arrival < latest_ms, flight.departure < due_before_ms
+        IS_OPEN, flight.arrival >= at_ms, flight.arrival < latest_ms, flight.departure < due_before_ms
     )
     seen = select(newest_positions.c.intent).where(newest_positions.c.intent == flight.sequence).exists()
-    overdue = select(flight.sequence).where(_OPEN, flight.arrival < at_ms, seen)
+    overdue = select(flight.sequence).where(IS_OPEN, flight.arrival < at_ms, seen)
     return [*connection.execute(flying).scalars(), *connection.execute(overdue).scalars()]
 
 

@@ -1,11 +1,12 @@
 """Reads that the ledger and its transactions share."""
 
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, select
+from sqlalchemy import ColumnElement, Connection, select, text
 
 from app.flight_intents import FlightIntent, Reservations
 from app.ledger.rows import by_intent, to_held, to_intent
@@ -16,12 +17,17 @@ from planner.airspace import Airspace
 # Databases bound how many values a statement may name.
 BOUND_AT_ONCE = 10_000
 
+# As the index of flights that can be moved says it: SQLite compares conditions by their text.
+ACCEPTED = text("flight_intents.state = 'accepted'")
+
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """One line of the append-only journal: a flight intent's new state, or what was remarked of an aircraft and why.
+    """One line of the append-only journal: a flight intent's new state, what was remarked of an aircraft and why, or a
+    constraint's beginning or removal.
 
-    `released` (n, 3): block, enter, exit of what the change took away. A track has sequence 0 and no intent id.
+    Entries of one revision happened at once; `place` orders them. `released` (n, 3): block, enter, exit of what the
+    change took away. Tracks and constraints have sequence 0 and no intent id. `details` says more of some kinds.
     """
 
     revision: int
@@ -32,6 +38,8 @@ class JournalEntry:
     released: IntArray
     track_id: str | None = None
     reasons: tuple[str, ...] = ()
+    place: int = 0
+    details: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,18 @@ def find(connection: Connection, airspace: Airspace, intent_id: str) -> FlightIn
     if row is None:
         return None
     return to_intent(row, airspace, reservations_of(connection, airspace, [row.sequence])[row.sequence])
+
+
+def find_all(connection: Connection, airspace: Airspace, sequences: Iterable[int]) -> list[FlightIntent]:
+    """Return intents with their reservations, by sequence."""
+    wanted = sorted(set(sequences))
+    found = []
+    for start in range(0, len(wanted), BOUND_AT_ONCE):
+        part = wanted[start : start + BOUND_AT_ONCE]
+        held = reservations_of(connection, airspace, part)
+        query = select(flight_intents).where(flight_intents.c.sequence.in_(part)).order_by(flight_intents.c.sequence)
+        found += [to_intent(row, airspace, held[row.sequence]) for row in connection.execute(query)]
+    return found
 
 
 def answer_to(connection: Connection, airspace: Airspace, operator: str, key: str) -> IdempotencyRecord | None:
@@ -95,20 +115,29 @@ def ids_of(connection: Connection, sequences: Iterable[int]) -> dict[int, str]:
     return ids
 
 
-def sequences_of(connection: Connection, intent_ids: Iterable[str]) -> dict[str, int]:
-    """Return the sequence numbers of intents by their ids, without those that there are not."""
+def sequences_of(connection: Connection, intent_ids: Iterable[str], operator: str | None = None) -> dict[str, int]:
+    """Return the sequence numbers of intents, of all or of an operator's, by those ids that there are."""
     sequences = {}
     unique = sorted(set(intent_ids))
     for start in range(0, len(unique), BOUND_AT_ONCE):
-        part = flight_intents.c.id.in_(unique[start : start + BOUND_AT_ONCE])
-        rows = connection.execute(select(flight_intents.c.id, flight_intents.c.sequence).where(part))
+        query = select(flight_intents.c.id, flight_intents.c.sequence)
+        query = query.where(flight_intents.c.id.in_(unique[start : start + BOUND_AT_ONCE]))
+        rows = connection.execute(query if operator is None else query.where(flight_intents.c.operator == operator))
         sequences.update({row.id: row.sequence for row in rows})
     return sequences
 
 
 def journal_after(connection: Connection, revision: int, limit: int | None) -> list[JournalEntry]:
-    """Return up to `limit` journal entries after a revision, oldest first."""
-    query = select(journal).where(journal.c.revision > revision).order_by(journal.c.revision).limit(limit)
+    """Return the journal entries after a revision, oldest first: up to `limit` of them and, where that would part
+    entries of one revision, those that belong to the last.
+    """
+    entry = journal.c
+    query = select(journal).where(entry.revision > revision).order_by(entry.revision, entry.place).limit(limit)
+    rows = list(connection.execute(query))
+    if rows and len(rows) == limit:
+        last = rows[-1]
+        rest = select(journal).where(entry.revision == last.revision, entry.place > last.place).order_by(entry.place)
+        rows += connection.execute(rest)
     return [
         JournalEntry(
             row.revision,
@@ -119,6 +148,8 @@ def journal_after(connection: Connection, revision: int, limit: int | None) -> l
             np.array(json.loads(row.released or "[]"), dtype=np.int64).reshape(-1, 3),
             row.track_id,
             tuple(json.loads(row.reasons or "[]")),
+            row.place,
+            json.loads(row.details or "{}"),
         )
-        for row in connection.execute(query)
+        for row in rows
     ]

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from itertools import chain
 from typing import Any
 
@@ -42,7 +42,8 @@ def to_row(intent: FlightIntent) -> dict[str, object]:
         "arrival": None if trajectory is None else trajectory.arrival_ms,
         "unconstrained": None if trajectory is None else trajectory.unconstrained_ms,
         "trajectory": None if trajectory is None else _dump_trajectory(trajectory),
-        "refusal": None if intent.refusal is None else json.dumps(asdict(intent.refusal)),
+        "submitted": trajectory is not None and trajectory.is_submitted,
+        "refusal": None if intent.refusal is None else _dump_refusal(intent.refusal),
         "activated": intent.activated_ms,
     }
 
@@ -60,10 +61,11 @@ def to_intent(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIn
 def _parsed(row: Row[Any], airspace: Airspace, held: Reservations) -> FlightIntent:
     trajectory = refusal = None
     if row.trajectory is not None:
-        trajectory = _load_trajectory(row.trajectory, row.unconstrained, airspace.terminal_dwell_ms)
+        trajectory = _load_trajectory(row.trajectory, row.unconstrained, airspace.terminal_dwell_ms, row.submitted)
     if row.refusal is not None:
         parts = json.loads(row.refusal)
-        refusal = Refusal(**{**parts, "conflicting_intents": tuple(parts["conflicting_intents"])})
+        conflicts = {name: tuple(parts.get(name, ())) for name in ("conflicting_intents", "conflicting_constraints")}
+        refusal = Refusal(**{**parts, **conflicts})
     return FlightIntent(
         id=row.id,
         sequence=row.sequence,
@@ -152,6 +154,11 @@ def _dump_trajectory(trajectory: Trajectory) -> str:
     return dump_columns(trajectory.block, trajectory.arrive_ms, trajectory.depart_ms)
 
 
-def _load_trajectory(text: str, unconstrained_ms: int, terminal_dwell_ms: int) -> Trajectory:
+def _load_trajectory(text: str, unconstrained_ms: int, terminal_dwell_ms: int, is_submitted: bool) -> Trajectory:
     block, arrive, depart = np.array(orjson.loads(text), dtype=np.int64).T.copy()
-    return Trajectory(block, arrive, depart, unconstrained_ms, terminal_dwell_ms)
+    return Trajectory(block, arrive, depart, unconstrained_ms, terminal_dwell_ms, is_submitted=is_submitted)
+
+
+def _dump_refusal(refusal: Refusal) -> str:
+    """Return a refusal as JSON, without what only its first answer says."""
+    return json.dumps({field.name: getattr(refusal, field.name) for field in fields(Refusal)})

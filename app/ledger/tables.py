@@ -23,6 +23,7 @@ counters = Table(
     Column("removed_before", BigInteger),
     Column("journal_removed", BigInteger),
     Column("positions_removed_before", BigInteger),
+    Column("lowest_priority", BigInteger),
 )
 
 # Times are ms since the epoch; `origin` and `destination` JSON objects of lon, lat, alt_m; `trajectory` a JSON list of
@@ -49,6 +50,7 @@ flight_intents = Table(
     Column("arrival", BigInteger),
     Column("unconstrained", BigInteger),
     Column("trajectory", Text),
+    Column("submitted", Boolean),
     Column("refusal", Text),
     Column("activated", BigInteger),
 )
@@ -62,12 +64,14 @@ reservations = Table(
     Column("intent", BigInteger),
 )
 
-# `released`: a JSON list of [block, enter, exit] that a change took away, null where it took none. What is remarked of
-# a track has intent 0 and no flight intent's id. `reasons`: a JSON list.
+# `place` orders the entries of one revision. `released`: a JSON list of [block, enter, exit] that a change took away,
+# null where it took none. What is of a track or of a constraint has intent 0 and no flight intent's id. `reasons`: a
+# JSON list, `details` a JSON object.
 journal = Table(
     "journal",
     metadata,
     Column("revision", BigInteger, primary_key=True),
+    Column("place", Integer, primary_key=True),
     Column("time", BigInteger),
     Column("kind", Text),
     Column("intent", BigInteger),
@@ -75,6 +79,7 @@ journal = Table(
     Column("released", Text),
     Column("track_id", Text),
     Column("reasons", Text),
+    Column("details", Text),
 )
 
 idempotency_keys = Table(
@@ -127,4 +132,21 @@ remarks = Table(
     Column("reasons", Text),
     Column("since", BigInteger),
     Column("raised", BigInteger),
+)
+
+# `polygon`: GeoJSON; `blocks`: a JSON list of flat indices. A constraint that was removed stays, for the past.
+constraints = Table(
+    "constraints",
+    metadata,
+    Column("number", BigInteger, primary_key=True),
+    Column("id", Text),
+    Column("name", Text),
+    Column("polygon", Text),
+    Column("blocks", Text),
+    Column("base_m", Double),
+    Column("top_m", Double),
+    Column("begins", BigInteger),
+    Column("ends", BigInteger),
+    Column("created", BigInteger),
+    Column("removed", BigInteger),
 )

@@ -12,16 +12,21 @@ from dataclasses import asdict, dataclass, fields, replace
 from itertools import takewhile
 from typing import Any
 
+import numpy as np
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, tuple_, update
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 
-from app.errors import LedgerUnavailable
-from app.flight_intents import FlightIntent, HeldReservations, Refusal, Reservations, State, Submission
+from app.constraints import MOST_CONSTRAINTS, Constraint
+from app.errors import LedgerUnavailable, TooManyConstraints
+from app.flight_intents import OPEN_STATES, FlightIntent, HeldReservations, Refusal, Reservations, State, Submission
+from app.ledger import constraints as closed
 from app.ledger import positions, queries
 from app.ledger.queries import IdempotencyRecord, JournalEntry
 from app.ledger.rows import columns_of, dump_columns, joined, to_held, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
+from app.ledger.webhooks import WebhookRows
 from app.surveillance import Aircraft, Remark, Sighting
+from planner.airmatrix import IntArray
 from planner.airspace import Airspace
 from planner.path import Trajectory
 
@@ -58,8 +63,15 @@ class Transaction:
         self._insert_reservations = insert_reservations
         self._counters = self._written = _Counters(*connection.execute(select(*_COUNTERS)).one())
         self._forget_pending()
+        # Where the next entry stands in the revision that several share; None where each has one of its own.
+        self._place: int | None = None
         self.write_s = 0.0
         self.commit_s = 0.0
+
+    @property
+    def sequence(self) -> int:
+        """The newest sequence number, with what this transaction has added."""
+        return self._counters.sequence
 
     @property
     def revision(self) -> int:
@@ -70,6 +82,20 @@ class Transaction:
     def journal_removed(self) -> int:
         """The revision up to which the journal has been removed."""
         return self._counters.journal_removed
+
+    @property
+    def lowest_priority(self) -> int:
+        """A priority that no open flight's is below: a flight of no more than that displaces nobody."""
+        return self._counters.lowest_priority
+
+    @contextmanager
+    def one_revision(self) -> Iterator[None]:
+        """Let all changes inside share one revision: whoever reads the journal sees all of them or none."""
+        self._place = 0
+        try:
+            yield
+        finally:
+            self._place = None
 
     @contextmanager
     def savepoint(self) -> Iterator[None]:
@@ -117,6 +143,7 @@ class Transaction:
             counters,
             sequence=counters.sequence + 1,
             longest_flight=max(counters.longest_flight, 0 if trajectory is None else trajectory.flight_time_ms),
+            lowest_priority=min(counters.lowest_priority, submission.priority),
         )
         revision = self._append(self._counters.sequence, intent_id, now_ms, state, released=None)
         intent = FlightIntent(
@@ -155,6 +182,64 @@ class Transaction:
         )
         held = intent.reservations.until(end_ms) if is_free else intent.reservations
         return intent.changed(revision, state, held, activated_ms)
+
+    @_asking()
+    def vacate(self, intents: Sequence[FlightIntent]) -> None:
+        """Take away all reservations of flights that are about to be rewritten."""
+        self.flush()
+        mine = reservations.c.intent.in_([intent.sequence for intent in intents])
+        self._connection.execute(delete(reservations).where(mine))
+
+    @_asking()
+    def rewrite(
+        self, before: FlightIntent, after: FlightIntent, now_ms: int, details: Mapping[str, object]
+    ) -> FlightIntent:
+        """Replace a vacated intent by what it is now, under its old sequence number and a new version, and return that.
+
+        Raises
+        ------
+        ConstraintViolated
+        """
+        self.flush()
+        submission, trajectory = after.submission, after.trajectory
+        counters = self._counters
+        self._counters = replace(
+            counters,
+            longest_flight=max(counters.longest_flight, 0 if trajectory is None else trajectory.flight_time_ms),
+            lowest_priority=min(counters.lowest_priority, submission.priority),
+        )
+        released = before.reservations.beyond(now_ms)
+        revision = self._append(before.sequence, before.id, now_ms, after.state, released, details=details)
+        intent = replace(after, version=revision)
+        row = to_row(intent)
+        try:
+            self._connection.execute(
+                update(flight_intents).where(flight_intents.c.sequence == row.pop("sequence")).values(row)
+            )
+            if len(intent.reservations):
+                self._insert_reservations(self._connection, joined([intent]))
+        except IntegrityError as error:
+            raise ConstraintViolated(cause_of(error)) from error
+        return intent
+
+    @_asking()
+    def movable(self, priority_below: int | None, departs_from_ms: int) -> IntArray:
+        """Return the sequence numbers of accepted flights that depart at a time or later and have not been activated;
+        of a lower priority only, where one is given.
+        """
+        self.flush()
+        flight = flight_intents.c
+        wanted = [flight.departure >= departs_from_ms, flight.activated.is_(None)]
+        if priority_below is not None:
+            wanted.append(flight.priority < priority_below)
+        query = select(flight.sequence).where(queries.ACCEPTED, *wanted)
+        return np.array(list(self._connection.execute(query).scalars()), dtype=np.int64)
+
+    @_asking()
+    def find_all(self, sequences: Iterable[int]) -> list[FlightIntent]:
+        """Return intents with their reservations, by sequence."""
+        self.flush()
+        return queries.find_all(self._connection, self._airspace, sequences)
 
     @_asking()
     def end_unseen(self, before_ms: int, limit: int, now_ms: int) -> list[tuple[int, str]]:
@@ -214,6 +299,43 @@ class Transaction:
         positions.remark(self._connection, changes)
 
     @_asking()
+    def record_constraint(self, constraint: Constraint, now_ms: int) -> Constraint:
+        """Write a constraint, and return it as it is written: made now, under the next number.
+
+        Raises
+        ------
+        TooManyConstraints
+        """
+        self.flush()
+        if closed.count_after(self._connection, now_ms) >= MOST_CONSTRAINTS:
+            raise TooManyConstraints(f"{MOST_CONSTRAINTS} constraints are in force, or will be: there may be no more")
+        recorded = closed.record(self._connection, replace(constraint, created_ms=now_ms))
+        self._append_constraint(recorded, now_ms, closed.CREATED)
+        return recorded
+
+    @_asking()
+    def remove_constraint(self, constraint: Constraint, now_ms: int) -> Constraint:
+        """Mark a constraint as removed, and return it so."""
+        self.flush()
+        self._append_constraint(constraint, now_ms, closed.REMOVED)
+        return closed.remove(self._connection, constraint, now_ms)
+
+    @_asking()
+    def constraint(self, constraint_id: str) -> Constraint | None:
+        """Return a constraint, also one that has ended or was removed; None if there is none."""
+        return closed.find(self._connection, constraint_id)
+
+    @_asking()
+    def constraints_after(self, time_ms: int) -> list[Constraint]:
+        """Return the constraints that are in force after a time, by number."""
+        return closed.after(self._connection, time_ms)
+
+    @_asking()
+    def constraint_ids(self, numbers: Iterable[int]) -> tuple[str, ...]:
+        """Return the ids of constraints by their numbers, in the order of these."""
+        return closed.ids_of(self._connection, numbers)
+
+    @_asking()
     def find(self, intent_id: str) -> FlightIntent | None:
         """Return an intent with its reservations, None if there is none."""
         if intent_id in self._new_intents:
@@ -221,11 +343,26 @@ class Transaction:
         return queries.find(self._connection, self._airspace, intent_id)
 
     @_asking()
+    def count_open(self, operator: str, limit: int) -> int:
+        """Return how many flights of an operator are not over; counted until there are so many."""
+        mine = select(flight_intents.c.sequence).where(flight_intents.c.operator == operator, positions.IS_OPEN)
+        mine = mine.limit(limit)
+        recorded = int(self._connection.execute(select(func.count()).select_from(mine.subquery())).scalar_one())
+        new = self._new_intents.values()
+        return recorded + sum(each.submission.operator == operator and each.state in OPEN_STATES for each in new)
+
+    @_asking()
     def ids(self, sequences: Iterable[int]) -> dict[int, str]:
         """Return the ids of intents by their sequence numbers."""
         wanted = set(sequences)
         new = {intent.sequence: id_ for id_, intent in self._new_intents.items() if intent.sequence in wanted}
         return new | (queries.ids_of(self._connection, wanted - new.keys()) if wanted - new.keys() else {})
+
+    @contextmanager
+    def webhooks(self) -> Iterator[WebhookRows]:
+        """Read and write webhooks."""
+        with _asking():
+            yield WebhookRows(self._connection)
 
     def journal_after(self, revision: int) -> list[JournalEntry]:
         """Return all journal entries after a revision, oldest first."""
@@ -296,14 +433,17 @@ class Transaction:
             self._counters = replace(self._counters, removed_before=removed_before)
         return len(sequences)
 
+    def forget_constraints(self, before_ms: int, limit: int) -> int:
+        """Delete up to `limit` constraints that ended or were removed before a time; return how many."""
+        return closed.forget(self._connection, before_ms, limit)
+
     def remove_journal(self, before_ms: int, limit: int) -> int:
         """Remove up to `limit` of the oldest journal entries, if they are from before a time; return how many."""
         self.flush()
         query = select(journal.c.revision, journal.c.time).order_by(journal.c.revision).limit(limit)
-        old = list(takewhile(lambda row: row.time < before_ms, self._connection.execute(query).all()))
-        # The newest entry stays: its time tells how far the ledger's own time has come.
-        if old and old[-1].revision == self.revision:
-            old.pop()
+        # The newest revision stays: its time tells how far the ledger's own time has come.
+        rows = self._connection.execute(query).all()
+        old = list(takewhile(lambda row: row.time < before_ms and row.revision < self.revision, rows))
         if old:
             self._counters = replace(self._counters, journal_removed=old[-1].revision)
             self.flush()
@@ -338,7 +478,7 @@ class Transaction:
 
     def flush(self) -> None:
         """Write the rows that wait, and how far the counters have come; raises `ConstraintViolated`."""
-        if self._counters == self._written:
+        if self._counters == self._written and not self._new_entries:
             return
         began = time.perf_counter()
         intents = list(self._new_intents.values())
@@ -364,6 +504,9 @@ class Transaction:
         self._new_keys: list[dict[str, Any]] = []
         self._new_answers: dict[tuple[str, str], IdempotencyRecord] = {}
 
+    def _append_constraint(self, constraint: Constraint, now_ms: int, kind: str) -> None:
+        self._append(0, "", now_ms, kind, released=None, details={"constraint_id": constraint.id})
+
     def _append(
         self,
         sequence: int,
@@ -373,12 +516,18 @@ class Transaction:
         released: Reservations | None,
         track_id: str | None = None,
         reasons: Sequence[str] = (),
+        details: Mapping[str, object] | None = None,
     ) -> int:
-        """Add a journal entry under the next revision, and return that."""
-        self._counters = replace(self._counters, revision=self._counters.revision + 1)
+        """Add a journal entry under the next revision, or the one that is shared, and return that."""
+        place = self._place or 0
+        if place == 0:
+            self._counters = replace(self._counters, revision=self._counters.revision + 1)
+        if self._place is not None:
+            self._place += 1
         self._new_entries.append(
             {
                 "revision": self.revision,
+                "place": place,
                 "time": now_ms,
                 "kind": str(kind),
                 "intent": sequence,
@@ -386,6 +535,7 @@ class Transaction:
                 "released": None if released is None else dump_columns(*columns_of(released)),
                 "track_id": track_id,
                 "reasons": json.dumps(reasons) if reasons else None,
+                "details": json.dumps(details) if details else None,
             }
         )
         return self.revision
@@ -401,6 +551,7 @@ class _Counters:
     removed_before: int
     journal_removed: int
     positions_removed_before: int
+    lowest_priority: int
 
 
 _COUNTERS = [counters.c[field.name] for field in fields(_Counters)]

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from app import problems
 from app.block_status import Status
 from app.errors import UnknownBlock
-from app.routes.flight_intents import BlockIndices
+from app.routes.answers import BlockIndices
 from app.service import Service, ServiceDep
 from app.times import LATEST_MS, Moment, Timestamp, format_time
 from planner.airmatrix import AirMatrix
@@ -120,6 +120,7 @@ class BlockAnswer(BaseModel):
     statically_occupied: bool
     status: Literal["idle"] | Status
     reasons: list[str]
+    constraints: Annotated[list[str], Field(description="Those that close the block now.")]
     removed_before: RemovedBefore
     schedule: list[ScheduleEntry]
 
@@ -240,6 +241,7 @@ def read_block(
         statically_occupied=bool(service.airspace.occupied[block]),
         status="idle" if present is None else present.status,
         reasons=[] if present is None else list(present.reasons),
+        constraints=[each.id for each in service.ledger.constraints_at(now_ms) if each.covers(np.array([block]))[0]],
         removed_before=service.ledger.removed().before_ms,
         schedule=[
             ScheduleEntry(flight_intent_id=ids[sequence], enter=enter, exit=leave)

@@ -18,7 +18,6 @@ _POLICY = (
     "default-src 'none'; script-src 'self'; worker-src blob:; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-_HEADERS = {"Content-Security-Policy": _POLICY, "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 # Asked for again each time, which the ETag makes cheap: after an upgrade no page mixes old files with new.
 _REVALIDATED = "no-cache"
 _KEPT_FOR_A_DAY = "public, max-age=86400"
@@ -44,7 +43,7 @@ async def read_vendor_file(request: Request, name: str) -> Response:
 
 async def _answer(files: StaticFiles, name: str, request: Request, caching: str) -> Response:
     response = await files.get_response(name, request.scope)
-    response.headers.update(_HEADERS | {"Cache-Control": caching})
+    response.headers.update({"Content-Security-Policy": _POLICY, "Cache-Control": caching})
     return response
 
 

@@ -1,6 +1,6 @@
 """The append-only journal, paged."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from pydantic import BaseModel
@@ -18,7 +18,8 @@ class Event(BaseModel):
     """One change of the ledger, in the order of the changes.
 
     `kind` is a flight intent's new state; or how the aircraft of a flight intent or of a track conforms now, with the
-    reasons.
+    reasons; or what became of a constraint. Events of one revision happened at once. Where a flight was planned again,
+    `details` tell the `cause`, by how much departure and arrival moved, and the reason if it was displaced.
     """
 
     revision: int
@@ -28,6 +29,7 @@ class Event(BaseModel):
     sequence: int | None
     track_id: str | None
     reasons: list[str]
+    details: dict[str, Any]
 
 
 class EventPage(BaseModel):
@@ -47,13 +49,14 @@ def list_events(
     after: Annotated[int, Query(ge=0, le=2**62, description="A revision; 0 for the beginning.")] = 0,
     limit: Annotated[int, Query(ge=1, le=paging.LIMIT)] = 100,
 ) -> EventPage:
-    """Return the changes after a revision, oldest first. Revisions have no gaps."""
-    # One more than asked for: whether there is another page.
-    entries = service.ledger.journal_after(after, limit + 1)
-    items = [event(entry) for entry in entries[:limit]]
+    """Return the changes after a revision, oldest first. Revisions have no gaps; those of one revision come together,
+    also beyond the limit.
+    """
+    entries = service.ledger.journal_after(after, limit)
+    last = entries[-1].revision if entries else after
     return EventPage(
-        items=items,
-        next_cursor=str(items[-1].revision) if len(entries) > limit else None,
+        items=[event(entry) for entry in entries],
+        next_cursor=str(last) if last < service.ledger.revision() else None,
         removed_through=service.ledger.removed().journal_through,
     )
 
@@ -68,4 +71,5 @@ def event(entry: JournalEntry) -> Event:
         sequence=entry.sequence or None,
         track_id=entry.track_id,
         reasons=list(entry.reasons),
+        details=dict(entry.details),
     )

@@ -1,193 +1,92 @@
-"""Flight intents: submit, preview, read, list, cancel."""
+"""Flight intents: submit, preview, read, list, change, cancel, activate, end."""
 
 import hashlib
-import time
-from typing import Annotated, Any
+import re
+from typing import Annotated
 from uuid import UUID
 
-import numpy as np
 import orjson
+from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Response
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from app import problems
-from app.deconfliction import IdempotencyKey, Outcome
-from app.errors import PriorityNotSupported, UnknownAircraftType, UnknownFlightIntent
-from app.flight_intents import FlightIntent, Position, Refusal, Reservations, State, Submission
+from app.auth import Caller, CallerDep
+from app.deconfliction import IdempotencyKey
+from app.errors import (
+    OperatorMismatch,
+    PreconditionRequired,
+    UnknownFlightIntent,
+)
+from app.flight_intents import Refusal, State
+from app.labels import Label
 from app.routes import paging
+from app.routes.answers import (
+    PATH,
+    ChangedFlightIntentAnswer,
+    FlightIntentAnswer,
+    FlightIntentPage,
+    PreviewAnswer,
+    intent_response,
+    more_of,
+    outcome_body,
+    outcome_response,
+    planned,
+    render,
+)
+from app.routes.submissions import AnyIntentBody, spoken_for, submitted
 from app.service import Service, ServiceDep
-from app.times import Moment, Timestamp, format_time, format_times
-from planner.airmatrix import AirMatrix
-from planner.errors import DestinationBlocked, NoPlan, OriginBlocked
-from planner.path import Trajectory
+from app.times import Timestamp, format_time
+from planner.errors import NoPlan
 
-router = APIRouter(prefix="/v1/flight-intents", tags=["flight intents"])
-
-Label = Annotated[
-    str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")
-]
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-BlockIndices = tuple[int, int, int]
-
-
-class PositionBody(BaseModel):
-    """A position: WGS84 degrees, metres above the airspace's ground datum."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    lon: Annotated[Finite, Field(ge=-180, le=180)]
-    lat: Annotated[Finite, Field(ge=-90, le=90)]
-    alt_m: Finite
-
-
-class FlightIntentBody(BaseModel):
-    """What an operator asks for."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {
-                    "operator": "acme-air",
-                    "reference": "ORD-7781",
-                    "aircraft_type": "dji-matrice-600-pro",
-                    "origin": {"lon": 71.4200, "lat": 51.1160, "alt_m": 20},
-                    "destination": {"lon": 71.4360, "lat": 51.1280, "alt_m": 20},
-                    "earliest_departure": "2026-11-22T08:00:00Z",
-                    "latest_departure": "2026-11-22T08:05:00Z",
-                    "priority": 0,
-                }
-            ]
-        },
-    )
-
-    operator: Label
-    reference: Label | None = None
-    aircraft_type: Label
-    origin: PositionBody
-    destination: PositionBody
-    earliest_departure: Timestamp
-    latest_departure: Annotated[
-        Timestamp | None, Field(description="Default: the earliest departure and the airspace's ground hold.")
-    ] = None
-    priority: Annotated[int, Field(strict=True, ge=-1000, le=1000)] = 0
-
-    @model_validator(mode="after")
-    def _window(self) -> "FlightIntentBody":
-        if self.latest_departure is not None and self.latest_departure < self.earliest_departure:
-            raise ValueError("latest_departure lies before earliest_departure")
-        return self
-
-
-class LocatedPosition(BaseModel):
-    """A position and the block that contains it."""
-
-    lon: float
-    lat: float
-    alt_m: float
-    block: BlockIndices
-
-
-class Waypoint(BaseModel):
-    """A block centre of a trajectory; from `depart` to the next `arrive` the straight link between the two."""
-
-    block: BlockIndices
-    lon: float
-    lat: float
-    alt_m: float
-    arrive: Moment
-    depart: Moment
-
-
-class Reservation(BaseModel):
-    """A block, held from `enter` until before `exit`."""
-
-    block: BlockIndices
-    enter: Moment
-    exit: Moment
-
-
-class RefusalBody(BaseModel):
-    """Why a recorded intent was refused."""
-
-    reason: str
-    detail: str
-    conflicting_intents: list[str]
-    earliest_feasible_departure: Moment | None
-
-
-class PlannedFlightBody(BaseModel):
-    """A planned flight: what was asked for and, unless it was refused, its path and reservations."""
-
-    state: str
-    operator: str
-    reference: str | None
-    aircraft_type: str
-    priority: int
-    origin: LocatedPosition
-    destination: LocatedPosition
-    earliest_departure: Moment
-    latest_departure: Moment
-    departure: Moment | None = None
-    arrival: Moment | None = None
-    flight_time_s: float | None = None
-    ground_hold_s: float | None = None
-    hover_s: float | None = None
-    delay_s: float | None = None
-    trajectory: list[Waypoint]
-    reservations: list[Reservation]
-
-
-class FlightIntentAnswer(PlannedFlightBody):
-    """A recorded flight intent."""
-
-    id: str
-    sequence: int
-    version: str
-    refusal: RefusalBody | None = None
-
-
-class FlightIntentPage(BaseModel):
-    """A page of flight intents by sequence."""
-
-    items: list[FlightIntentAnswer]
-    next_cursor: str | None
+router = APIRouter(prefix=PATH, tags=["flight intents"])
 
 
 @router.post(
     "",
     status_code=201,
     response_class=Response,
-    responses={201: {"model": FlightIntentAnswer}, **problems.documented(400, 409, 413, 422, 503)},
+    responses={201: {"model": ChangedFlightIntentAnswer}, **problems.documented(400, 409, 413, 422, 503)},
     summary="Submit a flight intent",
 )
 async def submit(
     service: ServiceDep,
-    body: FlightIntentBody,
+    caller: CallerDep,
+    body: AnyIntentBody,
     idempotency_key: Annotated[str | None, Header(min_length=1, max_length=255)] = None,
 ) -> Response:
-    """Plan the flight against everything reserved before, and reserve it; the answer is sent when that is durable."""
-    submission = _located(service, body)
+    """Plan the flight against everything reserved before, and reserve it; the answer is sent when that is durable.
+
+    A flight of higher `priority` is planned as if those of lower priority were not there that depart late enough to be
+    moved and have not been activated. Those in its way are planned again at once; `displaced` says what became of them.
+
+    With a `trajectory` of the operator's own instead, or `volumes`, that is checked and reserved as it is; where others
+    are in its way, a `path-conflicts` problem says where and proposes a plan.
+    """
+    body = spoken_for(caller, body)
+    submission = await submitted(service, body)
     key = None
     if idempotency_key is not None:
         digest = hashlib.sha256(orjson.dumps(body.model_dump(), option=orjson.OPT_SORT_KEYS)).hexdigest()
-        key = IdempotencyKey(idempotency_key, digest, lambda outcome: _outcome_body(service, outcome))
+        key = IdempotencyKey(idempotency_key, digest, lambda outcome: outcome_body(service, outcome))
     outcome = await service.deconfliction.submit(submission, key)
-    return _outcome_response(service, outcome)
+    return outcome_response(service, outcome)
 
 
 @router.post(
     "/preview",
     response_class=Response,
-    responses={200: {"model": PlannedFlightBody}, **problems.documented(400, 409, 413, 422, 503)},
+    responses={200: {"model": PreviewAnswer}, **problems.documented(400, 409, 413, 422, 503)},
     summary="Plan a flight without reserving it",
 )
-async def preview(service: ServiceDep, body: FlightIntentBody) -> Response:
+async def preview(service: ServiceDep, caller: CallerDep, body: AnyIntentBody) -> Response:
     """Answer what submitting this body would give at this moment; nothing is reserved or recorded."""
-    plan = await service.deconfliction.preview(_located(service, body))
+    submission = await submitted(service, spoken_for(caller, body))
+    plan = await service.deconfliction.preview(submission)
     if isinstance(plan, Refusal):
-        return Response(problems.refusal_body(plan), problems.KINDS[NoPlan].status, media_type=problems.MEDIA_TYPE)
-    answer = _planned(service.airspace.grid, "preview", plan.submission, plan.trajectory, plan.reservations)
+        content = problems.refusal_body(plan, more=more_of(service.airspace.grid, submission, plan))
+        return Response(content, problems.KINDS[NoPlan].status, media_type=problems.MEDIA_TYPE)
+    answer = planned(service.airspace.grid, "preview", plan.submission, plan.trajectory, plan.reservations)
+    answer["displaces"] = plan.displaces
     return Response(orjson.dumps(answer), media_type="application/json")
 
 
@@ -199,6 +98,7 @@ async def preview(service: ServiceDep, body: FlightIntentBody) -> Response:
 )
 def list_flight_intents(
     service: ServiceDep,
+    caller: CallerDep,
     operator: Label | None = None,
     state: State | None = None,
     from_: Annotated[
@@ -208,7 +108,13 @@ def list_flight_intents(
     limit: Annotated[int, Query(ge=1, le=paging.LIMIT)] = 50,
     cursor: str | None = None,
 ) -> Response:
-    """List intents in their order of arrival. Refused ones count with their departure window."""
+    """List intents in their order of arrival, an operator's own unless they may see all. Refused ones count with their
+    departure window.
+    """
+    if operator is not None and not caller.may_see(operator):
+        raise OperatorMismatch(f"the flight intents of operator {operator!r} are not yours to see")
+    if not caller.sees_all:
+        operator = caller.operator
     # One more than asked for: whether there is another page.
     found = service.ledger.page(
         after_sequence=paging.decode(cursor), limit=limit + 1, operator=operator, state=state, from_ms=from_, to_ms=to
@@ -225,14 +131,47 @@ def list_flight_intents(
     responses={200: {"model": FlightIntentAnswer}, **problems.documented(404, 503)},
     summary="Read a flight intent",
 )
-def read(service: ServiceDep, intent_id: str) -> Response:
+def read(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
     """Return an intent with the reservations it still holds."""
     intent = service.ledger.find(_id(intent_id))
-    if intent is None:
+    if intent is None or not caller.may_see(intent.submission.operator):
         removed_ms = service.ledger.removed().before_ms
         hint = "" if removed_ms is None else f"; those that ended before {format_time(removed_ms)} have been removed"
         raise UnknownFlightIntent(f"there is no flight intent {intent_id}{hint}")
-    return _intent_response(service, intent)
+    return intent_response(service, intent)
+
+
+@router.put(
+    "/{intent_id}",
+    response_class=Response,
+    responses={
+        200: {"model": ChangedFlightIntentAnswer},
+        **problems.documented(400, 404, 409, 412, 413, 422, 428, 503),
+    },
+    summary="Change a flight intent",
+)
+async def change(
+    service: ServiceDep,
+    caller: CallerDep,
+    intent_id: str,
+    body: AnyIntentBody,
+    if_match: Annotated[str | None, Header(max_length=1000, description="The `ETag` of what is to be changed.")] = None,
+) -> Response:
+    """Plan the flight anew with this body, under its old sequence number; where that fails, the old plan stands.
+
+    A flight that is activated and in the air keeps to its plan for some seconds more and goes on from there; only its
+    destination, reference and priority can change then.
+    """
+    versions = _versions(if_match)
+    own_id = await _own(service, caller, intent_id)
+    submission = await submitted(service, spoken_for(caller, body))
+    outcome = await service.deconfliction.change(own_id, submission, versions)
+    if isinstance(outcome, Refusal):
+        more = more_of(service.airspace.grid, submission, outcome)
+        content = problems.refusal_body(outcome, stands=intent_id, more=more)
+        return Response(content, problems.KINDS[NoPlan].status, media_type=problems.MEDIA_TYPE)
+    headers = {"ETag": f'"{outcome.intent.version}"'}
+    return Response(outcome_body(service, outcome), headers=headers, media_type="application/json")
 
 
 @router.delete(
@@ -241,9 +180,9 @@ def read(service: ServiceDep, intent_id: str) -> Response:
     responses={200: {"model": FlightIntentAnswer}, **problems.documented(404, 409, 503)},
     summary="Cancel a flight intent",
 )
-async def cancel(service: ServiceDep, intent_id: str) -> Response:
+async def cancel(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
     """Cancel an intent. Before departure its blocks are free at once; a departed flight keeps them until arrival."""
-    return _intent_response(service, await service.deconfliction.cancel(_id(intent_id)))
+    return intent_response(service, await service.deconfliction.cancel(await _own(service, caller, intent_id)))
 
 
 @router.post(
@@ -252,9 +191,9 @@ async def cancel(service: ServiceDep, intent_id: str) -> Response:
     responses={200: {"model": FlightIntentAnswer}, **problems.documented(404, 409, 503)},
     summary="Activate a flight intent",
 )
-async def activate(service: ServiceDep, intent_id: str) -> Response:
+async def activate(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
     """Say that an accepted flight is about to depart; who flies without that is nonconforming."""
-    return _intent_response(service, await service.deconfliction.activate(_id(intent_id)))
+    return intent_response(service, await service.deconfliction.activate(await _own(service, caller, intent_id)))
 
 
 @router.post(
@@ -263,31 +202,22 @@ async def activate(service: ServiceDep, intent_id: str) -> Response:
     responses={200: {"model": FlightIntentAnswer}, **problems.documented(404, 409, 503)},
     summary="End a flight intent",
 )
-async def end(service: ServiceDep, intent_id: str) -> Response:
+async def end(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
     """Say that a flight is over. Its blocks are free at once if it has not departed or was reported on the ground; else
     it keeps them until its arrival, for an aircraft does not vanish because a record did.
     """
-    return _intent_response(service, await service.deconfliction.end(_id(intent_id)))
+    return intent_response(service, await service.deconfliction.end(await _own(service, caller, intent_id)))
 
 
-def render(grid: AirMatrix, intent: FlightIntent) -> dict[str, Any]:
-    """Return an intent as JSON-ready values."""
-    refusal = intent.refusal
-    answer = {
-        "id": intent.id,
-        "sequence": intent.sequence,
-        "version": str(intent.version),
-        **_planned(grid, intent.state.value, intent.submission, intent.trajectory, intent.reservations),
-    }
-    if refusal is not None:
-        feasible_ms = refusal.earliest_feasible_departure_ms
-        answer["refusal"] = {
-            "reason": refusal.reason,
-            "detail": refusal.detail,
-            "conflicting_intents": refusal.conflicting_intents,
-            "earliest_feasible_departure": None if feasible_ms is None else format_time(feasible_ms),
-        }
-    return answer
+def _versions(if_match: str | None) -> frozenset[int] | None:
+    """Return the versions that a change is about, None for any (RFC 9110, If-Match)."""
+    if if_match is None:
+        raise PreconditionRequired("a change needs `If-Match` with the `ETag` of the flight intent as it was read")
+    if if_match.strip() == "*":
+        return None
+    tags = (tag.strip() for tag in if_match.split(","))
+    # What is no version of ours, weak tags among them, matches nothing.
+    return frozenset(int(tag[1:-1]) for tag in tags if re.fullmatch(r'"[0-9]{1,18}"', tag, re.ASCII))
 
 
 def _id(text: str) -> str:
@@ -299,121 +229,11 @@ def _id(text: str) -> str:
     return text
 
 
-def _located(service: Service, body: FlightIntentBody) -> Submission:
-    """Return a body as a submission; raises what is wrong with it whatever the traffic."""
-    if body.priority != 0:
-        raise PriorityNotSupported("this version plans every flight intent with priority 0; leave `priority` out")
-    if body.aircraft_type not in service.aircraft_types:
-        known = ", ".join(sorted(service.aircraft_types))
-        raise UnknownAircraftType(f"unknown aircraft type {body.aircraft_type!r}; known: {known}")
-    origin = Position(**body.origin.model_dump())
-    destination = Position(**body.destination.model_dump())
-    airspace = service.airspace
-    origin_block = airspace.free_block_at(origin.lon, origin.lat, origin.alt_m, OriginBlocked)
-    destination_block = airspace.free_block_at(destination.lon, destination.lat, destination.alt_m, DestinationBlocked)
-    service.deconfliction.check(origin_block, destination_block)
-    latest_ms = body.latest_departure
-    if latest_ms is None:
-        latest_ms = body.earliest_departure + int(service.settings.ground_hold_s * 1000)
-    return Submission(
-        operator=body.operator,
-        reference=body.reference,
-        aircraft_type=body.aircraft_type,
-        priority=body.priority,
-        origin=origin,
-        destination=destination,
-        origin_block=origin_block,
-        destination_block=destination_block,
-        earliest_departure_ms=body.earliest_departure,
-        latest_departure_ms=latest_ms,
-    )
-
-
-def _planned(
-    grid: AirMatrix,
-    state: str,
-    submission: Submission,
-    trajectory: Trajectory | None,
-    reservations: Reservations,
-) -> dict[str, Any]:
-    answer: dict[str, Any] = {
-        "state": state,
-        "operator": submission.operator,
-        "reference": submission.reference,
-        "aircraft_type": submission.aircraft_type,
-        "priority": submission.priority,
-        "origin": _position(grid, submission.origin, submission.origin_block),
-        "destination": _position(grid, submission.destination, submission.destination_block),
-        "earliest_departure": format_time(submission.earliest_departure_ms),
-        "latest_departure": format_time(submission.latest_departure_ms),
-    }
-    if trajectory is not None:
-        departure_ms, arrival_ms = trajectory.departure_ms, trajectory.arrival_ms
-        delay_ms = arrival_ms - submission.earliest_departure_ms - trajectory.unconstrained_ms
-        answer |= {
-            "departure": format_time(departure_ms),
-            "arrival": format_time(arrival_ms),
-            "flight_time_s": trajectory.flight_time_ms / 1000,
-            "ground_hold_s": (departure_ms - submission.earliest_departure_ms) / 1000,
-            "hover_s": trajectory.hover_ms / 1000,
-            "delay_s": delay_ms / 1000,
-        }
-    answer["trajectory"] = [] if trajectory is None else _waypoints(grid, trajectory)
-    answer["reservations"] = _reservations(grid, reservations)
-    return answer
-
-
-def _position(grid: AirMatrix, position: Position, block: int) -> dict[str, Any]:
-    return {"lon": position.lon, "lat": position.lat, "alt_m": position.alt_m, "block": grid.block(block)}
-
-
-def _waypoints(grid: AirMatrix, trajectory: Trajectory) -> list[dict[str, Any]]:
-    x, y, alt_m = grid.centres(trajectory.block).T
-    lon, lat = grid.unproject(x, y)
-    columns = zip(
-        grid.ijk(trajectory.block).tolist(),
-        np.round(lon, 10).tolist(),
-        np.round(lat, 10).tolist(),
-        alt_m.tolist(),
-        format_times(trajectory.arrive_ms),
-        format_times(trajectory.depart_ms),
-        strict=True,
-    )
-    names = ("block", "lon", "lat", "alt_m", "arrive", "depart")
-    return [dict(zip(names, values, strict=True)) for values in columns]
-
-
-def _reservations(grid: AirMatrix, held: Reservations) -> list[dict[str, Any]]:
-    columns = zip(grid.ijk(held.block).tolist(), format_times(held.enter_ms), format_times(held.exit_ms), strict=True)
-    return [{"block": block, "enter": enter, "exit": leave} for block, enter, leave in columns]
-
-
-def _outcome_body(service: Service, outcome: Outcome) -> bytes:
-    if outcome.intent.refusal is not None:
-        return problems.refusal_body(outcome.intent.refusal, outcome.intent)
-    return orjson.dumps(render(service.airspace.grid, outcome.intent))
-
-
-def _outcome_response(service: Service, outcome: Outcome) -> Response:
-    intent, timing = outcome.intent, outcome.timing
-    began = time.perf_counter()
-    content = outcome.replayed or outcome.rendered or _outcome_body(service, outcome)
-    spans = {
-        "queue": timing.queue_s,
-        "plan": timing.plan_s,
-        "commit": timing.commit_s,
-        "serialise": time.perf_counter() - began,
-    }
-    headers = {"Server-Timing": ", ".join(f"{name};dur={seconds * 1000:.3f}" for name, seconds in spans.items())}
-    if outcome.replayed is not None:
-        headers["Idempotent-Replayed"] = "true"
-    if intent.refusal is not None:
-        return Response(content, problems.KINDS[NoPlan].status, headers, problems.MEDIA_TYPE)
-    version = intent.version if outcome.replayed is None else orjson.loads(outcome.replayed)["version"]
-    headers |= {"Location": f"{router.prefix}/{intent.id}", "ETag": f'"{version}"'}
-    return Response(content, 201, headers, "application/json")
-
-
-def _intent_response(service: Service, intent: FlightIntent) -> Response:
-    content = orjson.dumps(render(service.airspace.grid, intent))
-    return Response(content, headers={"ETag": f'"{intent.version}"'}, media_type="application/json")
+async def _own(service: Service, caller: Caller, text: str) -> str:
+    """Return the id in a path if it is of an intent that the caller may change; raises `UnknownFlightIntent`."""
+    intent_id = _id(text)
+    if not caller.may_change_all:
+        operator = await to_thread.run_sync(service.ledger.operator_of, intent_id)
+        if operator is None or not caller.may_change(operator):
+            raise UnknownFlightIntent(f"there is no flight intent {text}")
+    return intent_id

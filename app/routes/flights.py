@@ -11,7 +11,7 @@ from app.alerts import Alert
 from app.conformance import Assessment, Conformance
 from app.flight_intents import OPEN_STATES, State
 from app.monitor import View
-from app.routes.flight_intents import BlockIndices
+from app.routes.answers import BlockIndices
 from app.routes.views import ClockAnswer, SightingAnswer, VelocityAnswer, clock, sighting
 from app.service import Service, ServiceDep
 from app.times import Moment, format_time
@@ -93,6 +93,7 @@ _WORDS = {
     "several_aircraft": "shares a block with another aircraft",
     "reserved_by_another": "is in a block that another flight has reserved",
     "in_building": "is in a block that a building occupies",
+    "in_constraint": "is in closed airspace",
 }
 
 

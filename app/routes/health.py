@@ -44,7 +44,7 @@ class Version(BaseModel):
     airspace: str
     ledger: Literal["sqlite", "postgresql"]
     mode: Mode
-    authentication: str
+    authentication: Literal["jwt", "none"]
     allow_unauthenticated: bool
 
 
@@ -82,7 +82,7 @@ async def read_version(service: ServiceDep) -> Version:
         airspace=service.airspace.id,
         ledger="sqlite" if parse_location(service.settings.ledger).is_sqlite else "postgresql",
         mode=_mode(service),
-        authentication="off",
+        authentication="none" if service.settings.jwks is None else "jwt",
         allow_unauthenticated=service.settings.allow_unauthenticated,
     )
 

@@ -21,7 +21,7 @@ from app.routes.airspace import (
     geojson,
     invalid,
 )
-from app.routes.flight_intents import BlockIndices
+from app.routes.answers import BlockIndices
 from app.routes.views import ClockAnswer, clock
 from app.service import Service, ServiceDep
 from app.times import Moment, Timestamp, format_time
@@ -31,13 +31,14 @@ router = APIRouter(prefix="/v1/airspace", tags=["airspace"])
 
 
 class BlockStatusAnswer(BaseModel):
-    """A block in use: whose it is, or who is in it, and why it is not green."""
+    """A block in use: whose it is, or who is in it, why it is not green, and which constraints close it, if any."""
 
     block: BlockIndices
     status: Status
     reasons: list[str]
     flight_intents: list[str]
     track_ids: list[str]
+    constraints: list[str] | None = None
 
 
 class StatusAnswer(BaseModel):
@@ -74,8 +75,9 @@ def read_status(
 ) -> Response:
     """Return green, yellow and red blocks: the paper's comparison of reservations with where aircraft are.
 
-    Red: several aircraft, an aircraft in a block that another flight holds, or in a building's. Yellow: an aircraft
-    where nothing is reserved, or a reservation whose flight is off track, early, late, lost, contingent or missing.
+    Red: several aircraft, an aircraft in a block that another flight holds, in a building's, or in closed airspace.
+    Yellow: an aircraft where nothing is reserved, or a reservation whose flight is off track, early, late, lost,
+    contingent or missing.
     """
     grid = service.airspace.grid
     if layer is not None:
@@ -112,6 +114,7 @@ def blocks(service: Service, view: View, entries: Sequence[BlockStatus]) -> list
             "reasons": entry.reasons,
             "flight_intents": [flights[each.sequence].id for each in entry.aircraft if not each.track_id],
             "track_ids": [each.track_id for each in entry.aircraft if each.track_id],
+            **({"constraints": entry.constraints} if entry.constraints else {}),
         }
         for entry in entries
     ]

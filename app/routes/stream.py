@@ -13,9 +13,11 @@ from fastapi.sse import format_sse_event
 from starlette.responses import StreamingResponse
 
 from app import problems
+from app.auth import Caller, CallerDep
 from app.conformance import Conformance
 from app.errors import LedgerUnavailable
 from app.ledger import JournalEntry
+from app.ledger.constraints import CONSTRAINT_KINDS
 from app.monitor import View
 from app.routes import flights, status
 from app.routes.events import event
@@ -28,7 +30,7 @@ router = APIRouter(prefix="/v1/airspace", tags=["airspace"])
 _POLL_S, _SILENCE_S = 0.1, 10.0
 # How long it leaves a ledger alone that has failed.
 _RETRY_S = 1.0
-_CONFORMANCE = frozenset(Conformance)
+_EVENTS = dict.fromkeys(Conformance, "conformance") | dict.fromkeys(CONSTRAINT_KINDS, "constraint")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +114,12 @@ class _Watcher:
         if self.revision < removed:
             events.append(_event("gap", {"removed_through": removed}))
         entries = ledger.journal_after(self.revision, self.board.entries_at_once)
-        events += [_journal_event(entry) for entry in entries]
+        # Only the last of a revision has its id: who resumes after it has had all of them.
+        last = {entry.revision: entry.place for entry in entries}
+        events += [_journal_event(entry, is_last=entry.place == last[entry.revision]) for entry in entries]
         if entries:
             self.revision = entries[-1].revision
-        self.is_behind = len(entries) == self.board.entries_at_once
+        self.is_behind = len(entries) >= self.board.entries_at_once
         return b"".join(events)
 
 
@@ -124,9 +128,12 @@ def _with_id(event: bytes, revision: int) -> bytes:
     return b"%sid: %d\n\n" % (event.removesuffix(b"\n"), revision)
 
 
-def _journal_event(entry: JournalEntry) -> bytes:
-    kind = "conformance" if entry.kind in _CONFORMANCE else "intent"
-    return _event(kind, {**event(entry).model_dump(mode="json"), "time": format_time(entry.time_ms)}, entry.revision)
+def _journal_event(entry: JournalEntry, *, is_last: bool) -> bytes:
+    return _event(
+        _EVENTS.get(entry.kind, "intent"),
+        {**event(entry).model_dump(mode="json"), "time": format_time(entry.time_ms)},
+        entry.revision if is_last else None,
+    )
 
 
 def _event(name: str, content: dict[str, Any], revision: int | None = None) -> bytes:
@@ -139,7 +146,7 @@ def _event(name: str, content: dict[str, Any], revision: int | None = None) -> b
     "/stream",
     response_class=StreamingResponse,
     responses={
-        200: {"description": "Server-Sent Events", "content": {"text/event-stream": {"schema": {"type": "string"}}}},
+        200: {"description": "Server-Sent Events", "content": {"text/event-stream": {}}},
         **problems.documented(422, 503),
     },
     summary="Watch the airspace",
@@ -147,6 +154,7 @@ def _event(name: str, content: dict[str, Any], revision: int | None = None) -> b
 async def watch(
     request: Request,
     service: ServiceDep,
+    caller: CallerDep,
     last_event_id: Annotated[
         int | None, Header(ge=0, le=2**62, description="The revision after which to go on; default: now.")
     ] = None,
@@ -154,25 +162,26 @@ async def watch(
     """Send what changes, about once a second.
 
     `status`: first all blocks in use (`full`), then those that changed and those that are `idle` again. `flights`: as
-    /v1/flights. `alerts`: as /v1/airspace/alerts, when they change. `intent` and `conformance`: the journal, whose
-    revisions are the ids that `Last-Event-ID` resumes after; `gap` if retention has removed some of what was missed.
+    /v1/flights. `alerts`: as /v1/airspace/alerts, when they change. `intent`, `conformance` and `constraint`: the
+    journal, whose revisions are the ids that `Last-Event-ID` resumes after; `gap` if retention has removed some of
+    what was missed.
     """
     board: Board = request.state.board
     revision = await to_thread.run_sync(service.ledger.revision)
     after = revision if last_event_id is None else min(last_event_id, revision)
     return StreamingResponse(
-        _events(service, board, after),
+        _events(service, caller, board, after),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-cache", "X-Accel-Buffering": "no"},
     )
 
 
-async def _events(service: Service, board: Board, revision: int) -> AsyncIterator[bytes]:
-    """Yield events until the client goes or the server ends."""
+async def _events(service: Service, caller: Caller, board: Board, revision: int) -> AsyncIterator[bytes]:
+    """Yield events until the client goes, its token expires or the server ends."""
     watcher = _Watcher(service, board, revision)
     tried: View | None = None
     silent_s = 0.0
-    while not service.closing.is_set():
+    while not service.closing.is_set() and not caller.is_expired():
         view = service.monitor.latest
         if view is None or (view is tried and not watcher.is_behind):
             await asyncio.sleep(_POLL_S)

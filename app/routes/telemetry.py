@@ -7,11 +7,20 @@ from anyio import to_thread
 from fastapi import APIRouter, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.config import JsonDict
 from pydantic_core import ErrorDetails, from_json
 
 from app import problems
-from app.errors import InvalidPosition, MalformedRequest, PositionNotFinite, PositionRefused, TooManyPositions
-from app.routes.flight_intents import Label
+from app.auth import PLAN, SURVEILLANCE, CallerDep
+from app.errors import (
+    InvalidPosition,
+    MalformedRequest,
+    PositionNotAllowed,
+    PositionNotFinite,
+    PositionRefused,
+    TooManyPositions,
+)
+from app.labels import Label
 from app.service import ServiceDep
 from app.surveillance import Sighting
 from app.telemetry import Report
@@ -21,6 +30,15 @@ router = APIRouter(prefix="/v1/telemetry", tags=["telemetry"])
 
 MAX_POSITIONS = 5_000
 
+_EXAMPLE: JsonDict = {
+    "track_id": "radar-17",
+    "time": "2026-11-22T08:00:00Z",
+    "lon": 71.4210,
+    "lat": 51.1165,
+    "alt_m": 61.5,
+    "airborne": True,
+}
+
 _Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
@@ -29,18 +47,7 @@ class PositionReport(BaseModel):
 
     model_config = ConfigDict(
         extra="forbid",
-        json_schema_extra={
-            "examples": [
-                {
-                    "track_id": "radar-17",
-                    "time": "2026-11-22T08:00:00Z",
-                    "lon": 71.4210,
-                    "lat": 51.1165,
-                    "alt_m": 61.5,
-                    "airborne": True,
-                }
-            ]
-        },
+        json_schema_extra={"examples": [_EXAMPLE]},
     )
 
     flight_intent_id: UUID | None = None
@@ -107,6 +114,8 @@ _BODY_SCHEMA = {
 }
 
 
+_SCOPE_FOR = {"flights": PLAN, "tracks": SURVEILLANCE}
+
 _POSITIONS = TypeAdapter(list[PositionReport])
 
 
@@ -117,20 +126,27 @@ _POSITIONS = TypeAdapter(list[PositionReport])
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"application/json": {"schema": _BODY_SCHEMA}},
+            "content": {"application/json": {"schema": _BODY_SCHEMA, "example": {"positions": [_EXAMPLE]}}},
         }
     },
     summary="Report positions",
 )
-async def report(service: ServiceDep, request: Request) -> TelemetryAnswer:
+async def report(service: ServiceDep, caller: CallerDep, request: Request) -> TelemetryAnswer:
     """Record where aircraft were. The answer is sent when that is durable; what is repeated is not recorded twice.
 
     Positions of the future, of another part of the world, of unknown flights or older than what is known are refused
     one by one. One that no aircraft can have reached from the last is taken, and flagged.
     """
     telemetry = service.telemetry
-    positions, refused = await to_thread.run_sync(_read, await request.body())
-    receipt = await telemetry.report([read for _, read in positions])
+    read, refused = await to_thread.run_sync(_read, await request.body())
+    allowed = {kind: scope in caller.scopes for kind, scope in _SCOPE_FOR.items()}
+    positions = [(index, position) for index, position in read if allowed[_kind(position)]]
+    refused |= {
+        index: PositionNotAllowed(f"positions of {_kind(position)} need the scope {_SCOPE_FOR[_kind(position)]}")
+        for index, position in read
+        if not allowed[_kind(position)]
+    }
+    receipt = await telemetry.report([position for _, position in positions], caller.operator)
     flagged = []
     for (index, _), entry in zip(positions, receipt.entries, strict=True):
         if isinstance(entry, PositionRefused):
@@ -182,6 +198,10 @@ def _report(position: PositionReport) -> Report:
         None if position.flight_intent_id is None else str(position.flight_intent_id),
         position.track_id,
     )
+
+
+def _kind(position: Report) -> str:
+    return "flights" if position.track_id is None else "tracks"
 
 
 def _problem(index: int, error: PositionRefused) -> PositionProblem:

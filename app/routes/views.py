@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from app.routes.flight_intents import BlockIndices
+from app.routes.answers import BlockIndices
 from app.service import Service
 from app.surveillance import Sighting
 from app.times import Moment, format_time

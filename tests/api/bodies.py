@@ -1,5 +1,6 @@
 """What operators and surveillance post, for the districts of the tests."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -16,11 +17,13 @@ PREVIEW = "/v1/flight-intents/preview"
 TELEMETRY = "/v1/telemetry"
 
 FLIGHT_INTENT = {
-    "id", "sequence", "version", "state", "operator", "reference", "aircraft_type", "priority", "origin", "destination",
-    "earliest_departure", "latest_departure", "departure", "arrival", "flight_time_s", "ground_hold_s", "hover_s",
-    "delay_s", "trajectory", "reservations",
+    "id", "sequence", "version", "state", "operator", "reference", "aircraft_type", "priority", "submitted", "origin",
+    "destination", "earliest_departure", "latest_departure", "departure", "arrival", "flight_time_s", "ground_hold_s",
+    "hover_s", "delay_s", "trajectory", "reservations",
 }  # fmt: skip
-PREVIEWED = FLIGHT_INTENT - {"id", "sequence", "version"}
+# What was just recorded or changed, and who made way for it.
+CHANGED = FLIGHT_INTENT | {"displaced"}
+PREVIEWED = FLIGHT_INTENT - {"id", "sequence", "version"} | {"displaces"}
 PLANNED = {"departure", "arrival", "flight_time_s", "ground_hold_s", "hover_s", "delay_s"}
 PROBLEM = {"type", "title", "status", "detail"}
 
@@ -46,6 +49,12 @@ def intent(
     if window_ms is not None:
         body["latest_departure"] = format_time(earliest_ms + window_ms)
     return {**body, **members}
+
+
+def recorded(answer: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the answer to a submission or a change as it can be read later: without those who made way."""
+    assert set(answer) == CHANGED
+    return {name: value for name, value in answer.items() if name != "displaced"}
 
 
 def position(

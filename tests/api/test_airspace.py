@@ -371,6 +371,7 @@ def test_a_block_says_where_it_is_and_who_uses_it_when(flown: Client) -> None:
         "statically_occupied": False,
         "status": "idle",
         "reasons": [],
+        "constraints": [],
         "removed_before": None,
         "schedule": [
             {

@@ -7,10 +7,21 @@ import pytest
 
 from app.flight_intents import State
 from app.main import create_app
-from app.routes.flight_intents import FlightIntentAnswer, FlightIntentPage, PlannedFlightBody
+from app.routes.answers import ChangedFlightIntentAnswer, FlightIntentAnswer, FlightIntentPage, PreviewAnswer
 from app.times import format_time, parse_time
 from planner.airspace import OccupancyRule
-from tests.api.bodies import FLIGHT_INTENT, PLANNED, PREVIEW, PREVIEWED, PROBLEM, SUBMIT, intent, problem
+from tests.api.bodies import (
+    CHANGED,
+    FLIGHT_INTENT,
+    PLANNED,
+    PREVIEW,
+    PREVIEWED,
+    PROBLEM,
+    SUBMIT,
+    intent,
+    problem,
+    recorded,
+)
 from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import DEPARTURE_MS, OLD_TOWN, START_MS, STREET, district
 from tests.ledger.locations import on_sqlite
@@ -37,13 +48,14 @@ def along(origin: str = "W", destination: str = "E", **members: object) -> dict[
 
 def test_an_accepted_intent_has_exactly_these_members(client: Client) -> None:
     answer = client.post(SUBMIT, json=intent()).json()
-    assert set(answer) == FLIGHT_INTENT
+    assert set(answer) == CHANGED
+    assert answer["displaced"] == []
     assert set(answer["origin"]) == {"lon", "lat", "alt_m", "block"}
     assert {frozenset(point) for point in answer["trajectory"]} == {
         frozenset({"block", "lon", "lat", "alt_m", "arrive", "depart"})
     }
     assert {frozenset(hold) for hold in answer["reservations"]} == {frozenset({"block", "enter", "exit"})}
-    FlightIntentAnswer.model_validate(answer)
+    ChangedFlightIntentAnswer.model_validate(answer)
 
 
 def test_an_accepted_intent_is_created_at_its_location_with_its_version_as_etag(client: Client) -> None:
@@ -53,7 +65,7 @@ def test_an_accepted_intent_is_created_at_its_location_with_its_version_as_etag(
     assert response.headers["content-type"] == "application/json"
     assert response.headers["location"] == f"/v1/flight-intents/{answer['id']}"
     assert response.headers["etag"] == f'"{answer["version"]}"'
-    assert client.get(response.headers["location"]).json() == answer
+    assert client.get(response.headers["location"]).json() == recorded(answer)
 
 
 def test_an_accepted_intent_repeats_what_was_asked(client: Client) -> None:
@@ -209,17 +221,18 @@ def test_an_aircraft_without_the_endurance_is_refused(
 def test_a_refusal_is_recorded_with_its_reasons_and_reserves_nothing(street: Client) -> None:
     first = street.post(SUBMIT, json=along()).json()
     refusal = street.post(SUBMIT, json=along(window_ms=0)).json()
-    recorded = street.get(f"{SUBMIT}/{refusal['flight_intent_id']}").json()
-    assert set(recorded) == (FLIGHT_INTENT - PLANNED) | {"refusal"}
-    assert (recorded["state"], recorded["sequence"]) == ("rejected", 2)
-    assert (recorded["trajectory"], recorded["reservations"]) == ([], [])
-    assert recorded["refusal"] == {
+    read = street.get(f"{SUBMIT}/{refusal['flight_intent_id']}").json()
+    assert set(read) == (FLIGHT_INTENT - PLANNED) | {"refusal"}
+    assert (read["state"], read["sequence"]) == ("rejected", 2)
+    assert (read["trajectory"], read["reservations"]) == ([], [])
+    assert read["refusal"] == {
         "reason": "no_departure_slot",
         "detail": refusal["detail"],
         "conflicting_intents": [first["id"]],
+        "conflicting_constraints": [],
         "earliest_feasible_departure": refusal["earliest_feasible_departure"],
     }
-    FlightIntentAnswer.model_validate(recorded)
+    FlightIntentAnswer.model_validate(read)
 
 
 # Previews
@@ -231,14 +244,15 @@ def test_a_preview_has_the_members_of_an_intent_without_its_numbers(client: Clie
     assert set(response.json()) == PREVIEWED
     assert response.json()["state"] == "preview"
     assert {"location", "etag"} & set(response.headers) == set()
-    PlannedFlightBody.model_validate(response.json())
+    PreviewAnswer.model_validate(response.json())
 
 
 def test_a_preview_is_what_the_submission_then_gets(street: Client) -> None:
     street.post(SUBMIT, json=along())
     preview = street.post(PREVIEW, json=along()).json()
     submitted = street.post(SUBMIT, json=along()).json()
-    assert {**preview, "state": "accepted"} == {name: submitted[name] for name in PREVIEWED}
+    assert preview.pop("displaces") == submitted.pop("displaced") == []
+    assert submitted == {**submitted, **preview, "state": "accepted"}
 
 
 def test_a_preview_records_nothing(client: Client) -> None:
@@ -326,7 +340,7 @@ def test_cancelling_answers_with_the_cancelled_intent(client: Client) -> None:
     response = client.delete(accepted.headers["location"])
     assert response.status_code == 200
     assert response.headers["etag"] == '"2"'
-    assert response.json() == {**accepted.json(), "state": "cancelled", "version": "2", "reservations": []}
+    assert response.json() == {**recorded(accepted.json()), "state": "cancelled", "version": "2", "reservations": []}
 
 
 def test_a_cancelled_intent_still_shows_the_path_it_had(client: Client) -> None:
@@ -346,7 +360,7 @@ def test_a_flight_that_has_arrived_cannot_be_cancelled(client: Client, clock: Fa
     accepted = client.post(SUBMIT, json=intent()).json()
     clock.now_ms = parse_time(accepted["arrival"]) + 1
     problem(client.delete(f"{SUBMIT}/{accepted['id']}"), 409, "illegal-transition")
-    assert client.get(f"{SUBMIT}/{accepted['id']}").json() == accepted
+    assert client.get(f"{SUBMIT}/{accepted['id']}").json() == recorded(accepted)
 
 
 def test_a_refused_intent_cannot_be_cancelled(street: Client) -> None:

@@ -27,7 +27,7 @@ from app.main import create_app
 from app.metrics import Metrics
 from app.settings import Settings
 from app.writer import BatchReport, Request
-from planner.errors import NoDepartureSlot, NoPlan, NotPlannable
+from planner.errors import NoDepartureSlot, NoPlan, NotPlannable, PathRefused
 from tests.api.bodies import PREVIEW, SUBMIT, intent
 from tests.api.serving import Client, served, serving
 from tests.ledger.district import OLD_TOWN
@@ -284,7 +284,7 @@ def moved_by(batch: BatchReport) -> Samples:
         (Outcome(flight_intent(State.ACCEPTED), replayed=b"{}"), outcome("replayed")),
         (Outcome(flight_intent(State.REJECTED, REFUSAL), replayed=b"{}"), outcome("replayed")),
         (flight_intent(State.CANCELLED), outcome("cancelled")),
-        (PreviewPlan(SUBMISSION, None, Reservations.none()), outcome("previewed")),  # type: ignore[arg-type]
+        (PreviewPlan(SUBMISSION, None, Reservations.none(), ()), outcome("previewed")),  # type: ignore[arg-type]
         (REFUSAL, outcome("previewed")),
         (NoDepartureSlot("why"), {}),
         (LedgerUnavailable("why"), {}),
@@ -432,7 +432,8 @@ def test_every_metric_is_named_as_prometheus_asks(client: Client) -> None:
 def test_what_can_be_refused_is_there_before_it_is(client: Client) -> None:
     reasons = {
         "not-plannable": [error.reason for error in NotPlannable.__subclasses__()],
-        "no-conflict-free-plan": [error.reason for error in NoPlan.__subclasses__()],
+        "path-refused": [error.reason for error in PathRefused.__subclasses__()],
+        "no-conflict-free-plan": [error.reason for error in NoPlan.__subclasses__() if error not in problems.KINDS],
     }
     kinds = [*problems.KINDS.values(), *problems.HTTP_ERRORS.values(), problems.VALIDATION, problems.INTERNAL]
     expected = {

@@ -193,7 +193,7 @@ def test_a_track_comes_and_is_lost_in_the_journal_and_goes_without_having_confor
     (first, *_) = lanes.get("/v1/events").json()["items"]
     assert first == {
         "revision": 1, "time": "2026-11-22T08:00:00.000Z", "kind": "deviating", "flight_intent_id": None,
-        "sequence": None, "track_id": "radar-1", "reasons": ["no_flight_intent"],
+        "sequence": None, "track_id": "radar-1", "reasons": ["no_flight_intent"], "details": {},
     }  # fmt: skip
 
 

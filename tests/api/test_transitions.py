@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from app.main import create_app
-from app.routes.flight_intents import FlightIntentAnswer
+from app.routes.answers import FlightIntentAnswer
 from app.settings import Settings
 from app.times import format_time, parse_time
 from tests.api.bodies import SUBMIT, TELEMETRY, intent, position, problem, report

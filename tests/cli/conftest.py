@@ -12,7 +12,7 @@ import pytest
 
 from app.cli import main
 from app.client import Client, ProblemAnswer
-from app.routes.flight_intents import FlightIntentAnswer
+from app.routes.answers import FlightIntentAnswer
 from app.times import now_ms
 from tests.cli.serving import Server, serving
 from tests.cli.town import along_row, town_airspace

@@ -19,7 +19,7 @@ from tests.cli.conftest import History, Run
 from tests.cli.serving import AIRMATRIX, environment, serving
 from tests.cli.test_serve import contents, foreign_database, names
 from tests.cli.town import along_row
-from tests.ledger.locations import PostgresqlLedgers, database, migrated_file, on_postgresql
+from tests.ledger.locations import HEAD, PostgresqlLedgers, database, migrated_file, on_postgresql
 from tests.ledger.process import assert_gapless, assert_no_overlaps
 
 
@@ -285,7 +285,7 @@ def test_a_database_is_upgraded_without_showing_its_password(airmatrix: Run, led
     password = urlsplit(location).password
     outcome = airmatrix("db", "upgrade", "--ledger", location)
     assert (outcome.status, outcome.err) == (0, "")
-    assert outcome.out == f"{location.replace(str(password), '***')} has schema 0003\n"
+    assert outcome.out == f"{location.replace(str(password), '***')} has schema {HEAD}\n"
 
 
 @on_postgresql

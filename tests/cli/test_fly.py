@@ -18,7 +18,7 @@ from app.client import Client
 from app.commands.fly import summary
 from app.commands.pilots import Report
 from app.flight_intents import State
-from app.routes.flight_intents import FlightIntentAnswer
+from app.routes.answers import FlightIntentAnswer
 from app.times import now_ms
 from tests.cli.conftest import Run, numbers
 from tests.cli.serving import AIRMATRIX, Server, environment, serving

@@ -19,7 +19,7 @@ from app.commands import pilots as pilots_module
 from app.commands.deviations import Deviations, Kind
 from app.commands.pilots import Dispatch, Pilots, Report, ServiceTime
 from app.flight_intents import State
-from app.routes.flight_intents import FlightIntentAnswer
+from app.routes.answers import FlightIntentAnswer
 from app.times import ServerClock, format_time, parse_time
 from tests.cli.town import GRID, LINK_MS, along_row, place
 

@@ -19,6 +19,7 @@ from app.errors import UnsafeListening
 from app.settings import Settings
 from tests.cli.conftest import Outcome, Run
 from tests.cli.serving import AIRMATRIX, Server, environment, serving, started
+from tests.ledger.locations import HEAD
 
 # Only ever refused.
 EVERYWHERE = "0.0.0.0"  # noqa: S104
@@ -96,7 +97,7 @@ def test_serving_without_authentication_is_loud_and_answers_every_host(tmp_path:
         version = httpx.get(f"{server.url}/version", headers={"Host": "airmatrix.example"})
         assert version.status_code == 200
         assert version.json()["allow_unauthenticated"] is True
-        assert version.json()["authentication"] == "off"
+        assert version.json()["authentication"] == "none"
         (warning,) = (line for line in server.log.read_text().splitlines() if "[warning" in line)
         assert "AIRMATRIX_ALLOW_UNAUTHENTICATED" in warning
 
@@ -225,7 +226,7 @@ def test_a_ledger_can_be_brought_to_the_newest_schema_again_and_again(airmatrix:
     before = contents(ledger)
     for _ in range(2):
         outcome = airmatrix("db", "upgrade", "--ledger", ledger)
-        assert (outcome.status, outcome.out, outcome.err) == (0, f"{ledger} has schema 0003\n", "")
+        assert (outcome.status, outcome.out, outcome.err) == (0, f"{ledger} has schema {HEAD}\n", "")
         assert contents(ledger) == before
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from app.client import Client
 from app.flight_intents import State
-from app.routes.flight_intents import FlightIntentAnswer
+from app.routes.answers import FlightIntentAnswer
 from app.times import format_time, now_ms
 from tests.cli.conftest import Outcome, Run, numbers
 from tests.cli.serving import AIRMATRIX, Server, environment

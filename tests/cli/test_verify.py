@@ -11,6 +11,7 @@ from app.times import format_time
 from tests.cli.conftest import History, Run
 from tests.cli.serving import Server
 from tests.cli.town import LINK_MS
+from tests.ledger.locations import HEAD
 
 SUMMARY = {
     "flight intents": "8 accepted, 1 rejected, 2 cancelled",
@@ -223,7 +224,7 @@ def test_a_ledger_of_another_airspace_is_refused(airmatrix: Run, ledger: Path) -
 def test_a_ledger_of_a_newer_schema_is_refused(airmatrix: Run, ledger: Path, town_file: Path) -> None:
     with tampering(ledger) as book:
         book.execute("UPDATE alembic_version SET version_num = '9999'")
-    refusal = ("schema 9999", "newer than this program's 0003")
+    refusal = ("schema 9999", f"newer than this program's {HEAD}")
     airmatrix("verify", "--ledger", ledger, "--airspace", town_file).assert_refused(*refusal)
 
 

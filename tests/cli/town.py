@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from app.routes.flight_intents import FlightIntentBody
+from app.routes.submissions import FlightIntentBody
 from app.times import format_time
 from planner.airmatrix import AirMatrix
 from planner.buildings import build_airspace, read_buildings

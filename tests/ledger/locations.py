@@ -10,9 +10,13 @@ from typing import Any, Protocol
 
 import psycopg
 import pytest
+from alembic.script import ScriptDirectory
 
 from app.ledger import create_or_upgrade
 from tests.postgres import Server
+
+# What the newest schema is called.
+HEAD = ScriptDirectory("migrations").get_current_head()
 
 # How a database says that it refuses rows; the text names the guard.
 REFUSED = (sqlite3.IntegrityError, psycopg.IntegrityError)

@@ -9,14 +9,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from app.deconfliction import Deconfliction, IdempotencyKey, OccupancyReplica, Outcome
+from app.deconfliction import Deconfliction, IdempotencyKey, Outcome
 from app.flight_intents import FlightIntent, Submission
 from app.ledger import open_ledger
+from app.replica import OccupancyReplica
+from app.scheduling import Periods, Scheduler
 from app.writer import BatchReport, Policy, Writer
 from planner.aircraft import shipped_aircraft_types
 from planner.airspace import Airspace
 from planner.cfa_star import Performance, Planner, Search
 from planner.kernels import intervals
+from planner.occupancy import OccupancyIndex
 from tests.ledger.district import START_MS
 from tests.ledger.locations import Stranger, database, write_lock
 
@@ -25,6 +28,7 @@ Hold = tuple[int, int, int]  # block, enter, exit
 DAY_MS = 86_400_000
 HORIZON_MS = 30 * DAY_MS
 POLICY = Policy(idempotency_ms=DAY_MS, queue_limit=1024)
+PERIODS = Periods(HORIZON_MS)
 
 
 @dataclass
@@ -58,6 +62,7 @@ class Process:
         observers: Sequence[Callable[[BatchReport], None]] = (),
         on_death: Callable[[], None] = lambda: None,
         policy: Policy = POLICY,
+        periods: Periods = PERIODS,
         search: Search = Search.SAFE_INTERVAL,
     ) -> None:
         self.location = location
@@ -73,7 +78,8 @@ class Process:
             observers=observers,
             on_death=on_death,
         )
-        self.deconfliction = Deconfliction(self.writer, self.ledger, self.planner, performances, HORIZON_MS, 5_000)
+        scheduler = Scheduler(self.planner, performances, periods)
+        self.deconfliction = Deconfliction(self.writer, self.ledger, scheduler, freshness_ms=5_000)
         self.writer.start()
 
     def __enter__(self) -> Self:
@@ -105,13 +111,17 @@ class Process:
 
     def indexed(self, now_ms: int) -> dict[Hold, int]:
         """Return the reservations of the index that end after `now_ms`, with the sequence numbers of their intents."""
-        table, pool, _ = self.planner.index.slabs
-        held = {}
-        for block, (first, count) in enumerate(table[:, : intervals.SIZE_CLASS].tolist()):
-            for enter, leave, owner in pool[first : first + count].tolist() if count else ():
-                if leave > now_ms:
-                    held[block, enter, leave] = owner
-        return held
+        return {hold: owner for hold, owner in content(self.planner.index).items() if owner > 0 and hold[2] > now_ms}
+
+
+def content(index: OccupancyIndex) -> dict[Hold, int]:
+    """Return what an index has, closures too, with the owners."""
+    table, pool, _ = index.slabs
+    held = {}
+    for block, (first, count) in enumerate(table[:, : intervals.SIZE_CLASS].tolist()):
+        for enter, leave, owner in pool[first : first + count].tolist() if count else ():
+            held[block, enter, leave] = owner
+    return held
 
 
 def outcomes(process: Process, *submissions: Submission) -> list[Outcome | BaseException]:
@@ -146,7 +156,7 @@ def assert_gapless(ledger: str | Path | Stranger) -> None:
     """Fail if a sequence number or revision is missing, or the counters lag behind."""
     with database(ledger) as connection:
         sequences = [row[0] for row in connection.rows("SELECT sequence FROM flight_intents ORDER BY sequence")]
-        revisions = [row[0] for row in connection.rows("SELECT revision FROM journal ORDER BY revision")]
+        revisions = [row[0] for row in connection.rows("SELECT DISTINCT revision FROM journal ORDER BY revision")]
         counters = connection.rows("SELECT sequence, revision FROM counters")
     assert sequences == list(range(1, len(sequences) + 1))
     assert revisions == list(range(1, len(revisions) + 1))
@@ -157,5 +167,5 @@ def assert_journal_tells_states(ledger: str | Path | Stranger) -> None:
     """Fail unless every intent's state and version are those of its newest journal entry."""
     with database(ledger) as connection:
         states = dict(connection.rows("SELECT sequence, state || version FROM flight_intents"))
-        newest = dict(connection.rows("SELECT intent, kind || revision FROM journal ORDER BY revision"))
-    assert states == newest
+        entries = connection.rows("SELECT intent, kind || revision FROM journal WHERE intent > 0 ORDER BY revision")
+    assert states == dict(entries)

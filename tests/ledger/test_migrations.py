@@ -13,7 +13,7 @@ from app.flight_intents import State
 from app.ledger import create_or_upgrade, open_ledger, parse_location
 from app.ledger.sqlite import APPLICATION_ID
 from tests.ledger.district import AIRCRAFT, SQUARE, START_MS, STREET
-from tests.ledger.locations import REFUSED, Ledgers, database
+from tests.ledger.locations import HEAD, REFUSED, Ledgers, database
 from tests.ledger.process import FakeClock, Process
 
 INTENT = (
@@ -123,13 +123,17 @@ def content_of(location: str) -> dict[str, list[tuple[Any, ...]]]:
 
 def test_a_ledger_of_the_second_version_keeps_every_row(second_version: str) -> None:
     before = content_of(second_version)
-    assert create_or_upgrade(second_version) == "0003"
+    assert create_or_upgrade(second_version) == HEAD
     after = content_of(second_version)
-    new = {"counters": (0,), "flight_intents": (None,), "journal": (None, None)}
-    assert after == {table: [(*row, *new.get(table, ())) for row in rows] for table, rows in before.items()}
+    # Since then: positions removed, the lowest priority; activated, submitted; track, reasons and details.
+    new = {"counters": (0, 0), "flight_intents": (None, False), "journal": (None, None, None)}
+    expected = {table: [(*row, *new.get(table, ())) for row in rows] for table, rows in before.items()}
+    # Each entry of the journal is its revision's first.
+    expected["journal"] = [(revision, 0, *rest) for revision, *rest in expected["journal"]]
+    assert after == expected
     assert sum(len(rows) for rows in after.values()) == 12
     with database(second_version) as connection:
-        for table in ("newest_positions", "position_history", "remarks"):
+        for table in ("newest_positions", "position_history", "remarks", "constraints", "webhooks", "webhook_events"):
             assert connection.rows(f"SELECT * FROM {table}") == []  # noqa: S608
 
 

@@ -12,7 +12,7 @@ from app.service import running
 from app.settings import Settings
 from planner.airspace import Airspace, OccupancyRule
 from tests.ledger.district import OLD_TOWN, STREET
-from tests.ledger.locations import Ledgers, content, database
+from tests.ledger.locations import HEAD, Ledgers, content, database
 from tests.ledger.process import FakeClock, Process
 from tests.ledger.test_racing import at_once
 
@@ -23,7 +23,7 @@ def test_a_ledger_of_a_newer_schema_is_not_touched(ledger: str) -> None:
     with database(ledger) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
     before = content(ledger)
-    with pytest.raises(LedgerOutdated, match="has schema 9999, newer than this program's 0003"):
+    with pytest.raises(LedgerOutdated, match=f"has schema 9999, newer than this program's {HEAD}"):
         create_or_upgrade(ledger)
     assert content(ledger) == before
 

@@ -8,24 +8,27 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from app.ledger import create_or_upgrade
-from tests.ledger.locations import REFUSED, Ledgers, Stranger, content, database, on_postgresql, on_sqlite
+from tests.ledger.locations import HEAD, REFUSED, Ledgers, Stranger, content, database, on_postgresql, on_sqlite
 from tests.ledger.process import Hold
 
 TABLES = {
-    "airspace", "alembic_version", "counters", "flight_intents", "idempotency_keys", "journal", "newest_positions",
-    "position_history", "remarks", "reservations",
+    "airspace", "alembic_version", "constraints", "counters", "flight_intents", "idempotency_keys", "journal",
+    "newest_positions", "position_history", "remarks", "reservations", "webhook_desk", "webhook_events", "webhooks",
 }  # fmt: skip
 INDICES = {
     "flight_intents_by_operator",
     "flight_intents_by_time",
     "flight_intents_by_end",
     "flight_intents_open",
+    "flight_intents_open_by_operator",
+    "flight_intents_movable",
     "reservations_by_intent",
     "idempotency_keys_by_age",
     "idempotency_keys_by_intent",
     "journal_by_intent",
     "newest_positions_by_time",
     "position_history_by_time",
+    "webhook_events_first",
 }
 CONSTRAINTS = {
     "airspace": {"airspace_only_one"},
@@ -37,6 +40,10 @@ CONSTRAINTS = {
     "newest_positions": set[str](),
     "position_history": set[str](),
     "remarks": set[str](),
+    "constraints": {"constraints_not_empty", "constraints_id"},
+    "webhooks": {"webhooks_id"},
+    "webhook_events": set[str](),
+    "webhook_desk": {"webhook_desk_only_one"},
 }
 # What holds reservations apart, and the journal as it is: SQLite has no exclusion constraints, and no TRUNCATE.
 SQLITE_TRIGGERS = {
@@ -144,7 +151,7 @@ def test_upgrading_a_ledger_at_head_changes_no_definition_and_no_row(ledgers: Le
     ledger = ledgers.vacant()
     create_or_upgrade(ledger)
     before = content(ledger)
-    assert create_or_upgrade(ledger) == "0003"
+    assert create_or_upgrade(ledger) == HEAD
     assert content(ledger) == before
 
 
@@ -279,14 +286,15 @@ def test_of_two_strangers_who_reserve_a_block_at_once_the_second_is_refused(ledg
     assert holds(migrated) == {(7, 10, 20)}
 
 
-ENTRY = (1, 5, "accepted", 1, "one", None, None, None)
+INSERT_ENTRY = "INSERT INTO journal VALUES (?, ?, 5, ?, 1, 'one', NULL, NULL, NULL, NULL)"
+ENTRY = (1, 0, 5, "accepted", 1, "one", None, None, None, None)
 
 
 @pytest.mark.parametrize(
     "statement", ["UPDATE journal SET kind = 'rejected'", "DELETE FROM journal"], ids=["update", "delete"]
 )
 def test_what_stands_in_the_journal_cannot_be_changed(statement: str, migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?, ?, ?)", ENTRY)
+    migrated.execute(INSERT_ENTRY, (1, 0, "accepted"))
     with pytest.raises(REFUSED, match="journal_append_only"):
         migrated.execute(statement)
     assert migrated.rows("SELECT * FROM journal") == [ENTRY]
@@ -294,9 +302,9 @@ def test_what_stands_in_the_journal_cannot_be_changed(statement: str, migrated: 
 
 @on_sqlite
 def test_what_stands_in_the_journal_cannot_be_replaced(migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?, ?, ?)", ENTRY)
+    migrated.execute(INSERT_ENTRY, (1, 0, "accepted"))
     with pytest.raises(REFUSED, match="journal_in_order"):
-        migrated.execute("INSERT OR REPLACE INTO journal VALUES (1, 5, 'rejected', 1, 'one', NULL, NULL, NULL)")
+        migrated.execute(INSERT_ENTRY.replace("INSERT", "INSERT OR REPLACE"), (1, 0, "rejected"))
     assert migrated.rows("SELECT * FROM journal") == [ENTRY]
 
 
@@ -306,29 +314,36 @@ def test_what_stands_in_the_journal_cannot_be_replaced(migrated: Stranger) -> No
     [
         ("TRUNCATE journal", "journal_append_only"),
         (
-            "INSERT INTO journal VALUES (1, 5, 'rejected', 1, 'one', NULL, NULL, NULL) "
-            "ON CONFLICT (revision) DO UPDATE SET kind = 'rejected'",
+            "INSERT INTO journal VALUES (1, 0, 5, 'rejected', 1, 'one', NULL, NULL, NULL, NULL) "
+            "ON CONFLICT (revision, place) DO UPDATE SET kind = 'rejected'",
             "journal_in_order",
         ),
     ],
     ids=["truncate", "upsert"],
 )
 def test_the_journal_can_be_neither_emptied_nor_overwritten(statement: str, guard: str, migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (?, ?, ?, ?, ?, ?, ?, ?)", ENTRY)
+    migrated.execute(INSERT_ENTRY, (1, 0, "accepted"))
     with pytest.raises(REFUSED, match=guard):
         migrated.execute(statement)
     assert migrated.rows("SELECT * FROM journal") == [ENTRY]
 
 
-def test_nothing_is_added_behind_the_newest_entry_of_the_journal(migrated: Stranger) -> None:
-    migrated.execute("INSERT INTO journal VALUES (3, 5, 'accepted', 1, 'one', NULL, NULL, NULL)")
+@pytest.mark.parametrize("behind", [(2, 0), (2, 9), (3, 0), (3, 1)])
+def test_nothing_is_added_behind_the_newest_entry_of_the_journal(behind: tuple[int, int], migrated: Stranger) -> None:
+    migrated.execute(INSERT_ENTRY, (3, 1, "accepted"))
     with pytest.raises(REFUSED, match="journal_in_order"):
-        migrated.execute("INSERT INTO journal VALUES (2, 5, 'cancelled', 1, 'one', NULL, NULL, NULL)")
+        migrated.execute(INSERT_ENTRY, (*behind, "cancelled"))
+
+
+def test_several_entries_may_be_one_revision(migrated: Stranger) -> None:
+    for key in ((3, 0), (3, 1), (3, 2), (4, 0)):
+        migrated.execute(INSERT_ENTRY, (*key, "accepted"))
+    assert migrated.rows("SELECT revision, place FROM journal") == [(3, 0), (3, 1), (3, 2), (4, 0)]
 
 
 def test_the_journal_gives_up_what_the_ledger_says_has_been_removed_and_nothing_newer(migrated: Stranger) -> None:
     for revision in (1, 2, 3):
-        migrated.execute("INSERT INTO journal VALUES (?, 5, 'accepted', 1, 'one', NULL, NULL, NULL)", [revision])
+        migrated.execute(INSERT_ENTRY, (revision, 0, "accepted"))
     migrated.execute("UPDATE counters SET journal_removed = 2")
     migrated.execute("DELETE FROM journal WHERE revision <= 2")
     with pytest.raises(REFUSED, match="journal_append_only"):

@@ -7,6 +7,7 @@ import numpy as np
 
 from app.block_status import statuses
 from app.conformance import Assessment, Thresholds, assess
+from app.constraints import Constraint
 from app.flight_intents import HeldReservations, State
 from app.surveillance import Aircraft, AirPicture, Flight, Path, Sighting, Velocity
 from planner.airmatrix import AirMatrix
@@ -93,11 +94,19 @@ def reserved(
     return HeldReservations(block, enter_ms, exit_ms, sequence)
 
 
+def constraint(number: int, blocks: Iterable[int]) -> Constraint:
+    """Return a constraint that closes some blocks for good."""
+    square: dict[str, Any] = {"type": "Polygon", "coordinates": []}
+    closed = np.array(sorted(blocks), dtype=np.int64)
+    return Constraint(number, f"constraint-{number}", "closed", square, 0.0, None, 0, None, closed, 0)
+
+
 class Moment:
     """One moment over the city: what flies, where it was seen, and how blocks and aircraft are judged.
 
     `seen` says who was seen where: the flight with a sequence number, or a track.
-    All flights hold their blocks, except those whose sequence numbers are in `released`.
+    All flights hold their blocks, except those whose sequence numbers are in `released`; `closed` are the signs of the
+    blocks that constraints close, a word for each.
     """
 
     def __init__(
@@ -110,6 +119,7 @@ class Moment:
         released: Sequence[int] = (),
         thresholds: Thresholds | None = None,
         is_forecast: bool = False,
+        closed: Sequence[str] = (),
     ) -> None:
         airspace = CITY.airspace
         picture = AirPicture(
@@ -118,6 +128,9 @@ class Moment:
             flights={each.sequence: each for each in flights},
             sightings={aircraft(who): sighting for who, sighting in (seen or {}).items()},
             is_forecast=is_forecast,
+            constraints=[
+                constraint(number, [CITY[sign] for sign in signs]) for number, signs in enumerate(closed, start=1)
+            ],
         )
         assessed = assess(picture, airspace.grid, thresholds or Thresholds())
         self.blocks, self._assessed = statuses(picture, assessed, airspace.occupied)
@@ -132,6 +145,11 @@ class Moment:
         """Return the aircraft that a block's status names."""
         (entry,) = (entry for entry in self.blocks if entry.block == CITY[sign])
         return list(entry.aircraft)
+
+    def closes(self, sign: str) -> tuple[str, ...]:
+        """Return the ids of the constraints that a block's status names."""
+        (entry,) = (entry for entry in self.blocks if entry.block == CITY[sign])
+        return entry.constraints
 
     def of(self, who: Who) -> Assessment:
         """Return the assessment of an aircraft."""

@@ -14,6 +14,7 @@ from app.flight_intents import OPEN_STATES, HeldReservations, State
 from app.surveillance import Aircraft, AirPicture, Flight, Path, Sighting
 from planner.airmatrix import AirMatrix
 from planner.airspace import Airspace, OccupancyRule
+from tests.monitoring.sky import constraint
 from tests.planner.traffic import EITHER_RULE, airspaces
 from tests.reference.block_status import Keeping, Use, keeping, uses
 from tests.reference.lattice import STEPS
@@ -83,7 +84,11 @@ def airs(draw: st.DrawFn) -> Air:
         for track in range(draw(st.sampled_from([0, 1, 2]))):
             sightings[Aircraft(0, f"track-{track}")] = draw(sightings_of(airspace, None, [hold for hold, _ in held]))
     columns = np.array([(*hold, sequence) for hold, sequence in held], dtype=np.int64).reshape(-1, 4).T
-    picture = AirPicture(NOW, HeldReservations(*columns), flights, sightings, is_forecast=is_forecast)
+    closed = draw(st.lists(st.sets(st.integers(0, airspace.grid.block_count - 1), min_size=1), max_size=2))
+    picture = AirPicture(
+        NOW, HeldReservations(*columns), flights, sightings, is_forecast=is_forecast,
+        constraints=[constraint(number, blocks) for number, blocks in enumerate(closed, start=1)],
+    )  # fmt: skip
     return Air(airspace, picture, thresholds)
 
 
@@ -151,7 +156,10 @@ def test_every_aircraft_and_every_block_is_judged_as_its_definition_says(air: Ai
         aircraft: Keeping(each.own.value, frozenset(each.reasons), each.place) for aircraft, each in judged.items()
     } == kept
     assert {
-        entry.block: Use(entry.status.value, frozenset(entry.reasons), frozenset(entry.aircraft)) for entry in blocks
+        entry.block: Use(
+            entry.status.value, frozenset(entry.reasons), frozenset(entry.aircraft), frozenset(entry.constraints)
+        )
+        for entry in blocks
     } == used
     in_red = {aircraft for aircraft, how in kept.items() if how.block in used and used[how.block].status == "red"}
     assert {aircraft for aircraft, each in judged.items() if each.conformance is Conformance.VIOLATING} == in_red

@@ -108,6 +108,30 @@ def test_the_free_block_above_a_building_is_not_red() -> None:
     assert Moment(12, [over_the_house], {1: at("C", 12)})["C"] == ("green",)
 
 
+def test_a_block_is_red_where_an_aircraft_is_in_closed_airspace() -> None:
+    now = Moment(12, [EASTBOUND], {"stranger": at("N", 12)}, closed=["NC"])
+    assert now["N"] == ("red", "in_constraint", "unplanned_use")
+    assert now.says("stranger") == ("violating", "no_flight_intent", "in_constraint")
+
+
+def test_a_flight_on_its_own_reservation_in_closed_airspace_is_red_and_violating_by_no_doing_of_its_own() -> None:
+    now = Moment(12, [EASTBOUND], {1: at("B", 12)}, closed=["B"])
+    assert now["B"] == ("red", "in_constraint")
+    assert now.says(1) == ("violating", "in_constraint")
+    assert not now.of(1).deviates
+
+
+def test_closed_airspace_is_not_red_where_only_a_reservation_or_an_aircraft_on_the_ground_is() -> None:
+    now = Moment(12, [EASTBOUND], {1: at("B", 12), "stranger": at("E", 12, airborne=False)}, closed=["CE", "cN"])
+    assert (now["C"], now["E"], now["N"]) == (("green",), None, None)
+    assert now["B"] == ("green",)
+
+
+def test_a_block_tells_all_constraints_that_close_it() -> None:
+    now = Moment(12, [EASTBOUND], {1: at("B", 12)}, closed=["BC", "A", "C"])
+    assert (now.closes("B"), now.closes("C")) == (("constraint-1",), ("constraint-1", "constraint-3"))
+
+
 # Yellow
 
 

@@ -26,11 +26,12 @@ class Keeping(NamedTuple):
 
 
 class Use(NamedTuple):
-    """A block's status, all reasons for it, and the aircraft concerned."""
+    """A block's status, all reasons for it, the aircraft concerned, and the constraints that close it."""
 
     status: str
     reasons: frozenset[str]
     aircraft: frozenset[Aircraft]
+    constraints: frozenset[str]
 
 
 class _Stage(NamedTuple):
@@ -77,6 +78,9 @@ def uses(picture: AirPicture, kept: dict[Aircraft, Keeping], occupied: BoolArray
             red.add("reserved_by_another")
         if inside and occupied[block]:
             red.add("in_building")
+        closed_by = {constraint.id for constraint in picture.constraints if block in constraint.blocks.tolist()}
+        if inside and closed_by:
+            red.add("in_constraint")
         if inside and not reserved_by:
             yellow.add("unplanned_use")
         for holder in reserved_by:
@@ -85,7 +89,8 @@ def uses(picture: AirPicture, kept: dict[Aircraft, Keeping], occupied: BoolArray
             if picture.flights[holder.sequence].state is State.CONTINGENT and not picture.is_forecast:
                 yellow.add("contingent")
         status = "red" if red else "yellow" if yellow else "green"
-        used[block] = Use(status, frozenset(red | yellow), frozenset(inside | set(reserved_by)))
+        concerned = frozenset(inside | set(reserved_by))
+        used[block] = Use(status, frozenset(red | yellow), concerned, frozenset(closed_by))
     return used
 
 

@@ -1,0 +1,327 @@
+"""Who flies when: plans against what is reserved, and makes way for what comes first (domain: strategic deconfliction).
+
+A flight of higher priority is planned as if those of lower priority that can still move were not there, and closed
+airspace moves whom it hits. Who has to make way is planned again in the same transaction, by priority and then by
+sequence, around everything and displacing nobody. All of it runs in the writer's thread.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.errors import BeyondHorizon, DepartureInThePast, IllegalTransition, NotChangeable
+from app.flight_intents import Displacement, FlightIntent, Refusal, Reservations, State, Submission
+from app.ledger import Transaction
+from app.submitted_paths import path_refusal
+from app.times import format_time
+from planner.airmatrix import IntArray
+from planner.cfa_star import Performance, Planner, PlanRequest
+from planner.errors import NoPlan
+from planner.holds import holds_of
+from planner.occupancy import Closure, OccupancyIndex
+from planner.path import Plan
+from planner.submitted import PathConflicts, SubmittedPath, conflicts
+
+# A departure window may have opened before the intent came, but not longer ago than this.
+_OPEN_FOR_MS = 86_400_000
+
+
+class AircraftTypeGone(NoPlan):
+    """A flight was accepted when its aircraft type was known, which it is no more."""
+
+    reason = "aircraft_type_gone"
+
+
+@dataclass(frozen=True)
+class Periods:
+    """How far ahead flights may depart, how long before its departure a flight can no longer be moved, and from how
+    soon on a flight in the air can be planned anew: in ms."""
+
+    horizon_ms: int
+    notice_ms: int = 60_000
+    lead_ms: int = 5_000
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why flights had to make way: a flight intent or a constraint."""
+
+    flight_intent_id: str | None = None
+    constraint_id: str | None = None
+
+    def __str__(self) -> str:
+        if self.flight_intent_id is not None:
+            return f"flight intent {self.flight_intent_id}, which has a higher priority"
+        return f"constraint {self.constraint_id}"
+
+    def member(self) -> dict[str, str]:
+        """Return it as a member of a journal entry's details."""
+        if self.flight_intent_id is not None:
+            return {"flight_intent_id": self.flight_intent_id}
+        return {"constraint_id": str(self.constraint_id)}
+
+
+class Scheduler:
+    """Plans flights, and moves those that have to make way. Changes the planner's index as it changes the ledger."""
+
+    def __init__(self, planner: Planner, performances: Mapping[str, Performance], periods: Periods) -> None:
+        self.planner = planner
+        self._performances = performances
+        self._periods = periods
+
+    @property
+    def index(self) -> OccupancyIndex:
+        """All that is reserved and closed."""
+        return self.planner.index
+
+    def plan(self, transaction: Transaction, now: int, submission: Submission, own: FlightIntent | None = None) -> Plan:
+        """Return a plan around all that may not be moved for this submission, and around nothing of its `own`; the
+        submission's own path, if it has one.
+
+        Raises
+        ------
+        DepartureInThePast, BeyondHorizon, NoPlan
+        """
+        self.check_window(submission, now)
+        index = self._unyielding(transaction, now, submission, own)
+        if submission.path is not None:
+            return self._as_submitted(submission, submission.path, now, index, own)
+        return self.planner.plan(self.request(submission, now), index)
+
+    def _as_submitted(
+        self,
+        submission: Submission,
+        path: SubmittedPath,
+        now: int,
+        index: OccupancyIndex,
+        own: FlightIntent | None,
+    ) -> Plan:
+        """Return an operator's own path as a plan; raises `DepartureInThePast` and `PathConflicts`."""
+        if path.departure_ms < now:
+            raise DepartureInThePast(
+                f"the path begins at {format_time(path.departure_ms)}, which has passed; it is {format_time(now)}"
+            )
+        request = self.request(submission, now)
+        found = conflicts(self.planner.airspace.grid, index, path)
+        if not found.count:
+            return path.plan(self.planner.unconstrained(request), self.planner.airspace.terminal_dwell_ms)
+        try:
+            proposal = self.planner.plan(request, index)
+        except NoPlan:
+            raise PathConflicts(found, None) from None
+        raise PathConflicts(found, proposal, self.in_the_way(proposal, own))
+
+    def continued(self, transaction: Transaction, now: int, submission: Submission, own: FlightIntent) -> Plan:
+        """Return a plan for a flight in the air: as it was planned until soon, then to where it wants to go now.
+
+        It leaves its path at the first block centre that it reaches after the lead, that is not closed, and that is
+        not where it is to land.
+
+        Raises
+        ------
+        NotChangeable, IllegalTransition, NotPlannable, NoPlan
+        """
+        assert own.trajectory is not None
+        self._check_unchanged(own.submission, submission)
+        path = own.trajectory
+        if submission.path is not None:
+            raise NotChangeable("the flight is in the air, where no path can be submitted")
+        needed = holds_of(self.planner.airspace, path.block, path.arrive_ms, path.depart_ms)
+        if not all(map(np.array_equal, needed, _columns(own.reservations))):
+            raise NotChangeable("the flight is in the air and flies in volumes: nobody knows where it will be")
+        from_ms = max(now + self._periods.lead_ms, path.departure_ms + path.terminal_dwell_ms)
+        index = self._unyielding(transaction, now, submission, own)
+        for place in range(int(np.searchsorted(path.depart_ms, from_ms)), len(path.block) - 1):
+            block, start_ms = int(path.block[place]), max(int(path.arrive_ms[place]), from_ms)
+            if block != submission.destination_block and not index.owners(block, start_ms, start_ms + 1):
+                flown = replace(
+                    path,
+                    block=path.block[: place + 1],
+                    arrive_ms=path.arrive_ms[: place + 1],
+                    depart_ms=path.depart_ms[: place + 1],
+                )
+                performance = self._performances[submission.aircraft_type]
+                request = PlanRequest(block, submission.destination_block, performance, start_ms, start_ms)
+                return self.planner.continued(flown, request, index)
+        raise IllegalTransition(f"flight intent {own.id} is about to land, and can no longer be planned anew")
+
+    def in_the_way(self, plan: Plan, own: FlightIntent | None = None) -> tuple[int, ...]:
+        """Return the sequence numbers of the flights that would have to make way for a plan."""
+        owners = self.index.owners_within(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
+        return tuple(owner for owner in owners if own is None or owner != own.sequence)
+
+    def within(self, transaction: Transaction, now: int, closure: Closure) -> "Hit":
+        """Return the flights that hold, from now on, some of what is to be closed."""
+        owners = self.index.owners_within(closure.block, np.maximum(closure.enter_ms, now), closure.exit_ms)
+        movable = set(self._movable(transaction, now, None).tolist())
+        flights = [owner for owner in owners if owner > 0]
+        return Hit(
+            tuple(owner for owner in flights if owner in movable),
+            tuple(owner for owner in flights if owner not in movable),
+        )
+
+    def vacate(self, transaction: Transaction, now: int, sequences: Sequence[int]) -> list[FlightIntent]:
+        """Take away all that some flights hold, in the index too; return them as they were."""
+        if not sequences:
+            return []
+        intents = transaction.find_all(sequences)
+        transaction.vacate(intents)
+        for intent in intents:
+            self.index.release(*_columns(intent.reservations.beyond(now)))
+        return intents
+
+    def settle(
+        self, transaction: Transaction, now: int, vacated: Sequence[FlightIntent], cause: Cause
+    ) -> tuple[Displacement, ...]:
+        """Plan vacated flights again, by priority and then by sequence; who finds no place is displaced.
+
+        They depart after their operators have had notice.
+        """
+        return tuple(
+            self._settle(transaction, now, intent, cause)
+            for intent in sorted(vacated, key=lambda intent: (-intent.submission.priority, intent.sequence))
+        )
+
+    def reserve(self, intent: FlightIntent) -> None:
+        """Bring what an intent holds into the index."""
+        self.index.reserve(*_columns(intent.reservations), intent.sequence)
+
+    def _settle(self, transaction: Transaction, now: int, intent: FlightIntent, cause: Cause) -> Displacement:
+        try:
+            plan = self.planner.plan(self.request(intent.submission, now + self._periods.notice_ms))
+        except NoPlan as error:
+            told = refusal(error, transaction)
+            detail = f"displaced by {cause}, and then: {told.detail}"
+            after = replace(
+                intent,
+                state=State.DISPLACED,
+                trajectory=None,
+                reservations=Reservations.none(),
+                refusal=replace(told, detail=detail),
+            )
+            self._rewrite(transaction, now, intent, after, cause, error.reason)
+            return Displacement(
+                intent.sequence, intent.id, intent.submission.operator, State.DISPLACED, reason=error.reason
+            )
+        after = replace(intent, trajectory=plan, reservations=reservations(plan))
+        self._rewrite(transaction, now, intent, after, cause)
+        return Displacement(
+            intent.sequence, intent.id, intent.submission.operator, intent.state, *moved_ms(intent, after)
+        )
+
+    def _rewrite(
+        self,
+        transaction: Transaction,
+        now: int,
+        before: FlightIntent,
+        after: FlightIntent,
+        cause: Cause,
+        reason: str | None = None,
+    ) -> None:
+        transaction.rewrite(before, after, now, details_of(before, after, cause, reason))
+        self.reserve(after)
+
+    def _unyielding(
+        self, transaction: Transaction, now: int, submission: Submission, own: FlightIntent | None
+    ) -> OccupancyIndex:
+        """Return an index of what a submission has to be planned around."""
+        gone = [] if own is None else [own.sequence]
+        if submission.priority > transaction.lowest_priority:
+            gone += self._movable(transaction, now, submission.priority).tolist()
+        return self.index.without(np.array(gone, dtype=np.int64)) if gone else self.index
+
+    def _movable(self, transaction: Transaction, now: int, priority_below: int | None) -> IntArray:
+        return transaction.movable(priority_below, now + self._periods.notice_ms)
+
+    def request(self, submission: Submission, from_ms: int) -> PlanRequest:
+        """Return what to ask of the planner for a departure at a time or later; raises `AircraftTypeGone`."""
+        performance = self._performances.get(submission.aircraft_type)
+        if performance is None:
+            raise AircraftTypeGone(f"the service no longer knows the aircraft type {submission.aircraft_type!r}")
+        return PlanRequest(
+            submission.origin_block,
+            submission.destination_block,
+            performance,
+            max(submission.earliest_departure_ms, from_ms),
+            submission.latest_departure_ms,
+        )
+
+    def check_window(self, submission: Submission, now: int) -> None:
+        """Raise `DepartureInThePast` or `BeyondHorizon` where a departure window is not one to plan for."""
+        if submission.latest_departure_ms < now:
+            raise DepartureInThePast(
+                f"the latest departure, {format_time(submission.latest_departure_ms)}, has passed; "
+                f"it is {format_time(now)}"
+            )
+        if submission.earliest_departure_ms < now - _OPEN_FOR_MS:
+            raise DepartureInThePast(
+                f"the earliest departure, {format_time(submission.earliest_departure_ms)}, is more than a day ago; "
+                f"it is {format_time(now)}"
+            )
+        horizon = now + self._periods.horizon_ms
+        if submission.latest_departure_ms > horizon:
+            raise BeyondHorizon(f"flights can be planned to depart until {format_time(horizon)}; submit this one later")
+
+    def _check_unchanged(self, before: Submission, after: Submission) -> None:
+        """Raise `NotChangeable` for what a flight in the air cannot change any more."""
+        for name in ("aircraft_type", "origin_block", "earliest_departure_ms", "latest_departure_ms"):
+            if getattr(before, name) != getattr(after, name):
+                field = name.removesuffix("_ms").removesuffix("_block")
+                raise NotChangeable(
+                    f"the flight is in the air, so `{field}` has to stay as it is; "
+                    "destination, reference and priority can change"
+                )
+
+
+@dataclass(frozen=True)
+class Hit:
+    """The flights that hold what is to be closed, by sequence number: who can make way, and who no longer can."""
+
+    movable: tuple[int, ...]
+    unmovable: tuple[int, ...]
+
+
+def reservations(plan: Plan) -> Reservations:
+    """Return what a plan holds."""
+    return Reservations(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
+
+
+def refusal(error: NoPlan, transaction: Transaction) -> Refusal:
+    """Return why there is no plan, with the ids of the flights and constraints in the way."""
+    flights = [owner for owner in error.conflicting_owners if owner > 0]
+    ids = transaction.ids(flights)
+    closed = transaction.constraint_ids(-owner for owner in error.conflicting_owners if owner < 0)
+    told = Refusal(
+        reason=error.reason,
+        detail=str(error),
+        conflicting_intents=tuple(ids[owner] for owner in flights if owner in ids),
+        earliest_feasible_departure_ms=error.earliest_feasible_departure_ms,
+        conflicting_constraints=closed,
+    )
+    return path_refusal(told, error, transaction) if isinstance(error, PathConflicts) else told
+
+
+def moved_ms(before: FlightIntent, after: FlightIntent) -> tuple[int | None, int | None]:
+    """Return how much later a flight departs and arrives than before; None where it has or had no plan."""
+    old, new = before.trajectory, after.trajectory
+    if old is None or new is None:
+        return None, None
+    return new.departure_ms - old.departure_ms, new.arrival_ms - old.arrival_ms
+
+
+def details_of(
+    before: FlightIntent, after: FlightIntent, cause: Cause | None = None, reason: str | None = None
+) -> dict[str, object]:
+    """Return the details of a journal entry about a flight that was planned again."""
+    departure_ms, arrival_ms = moved_ms(before, after)
+    return {
+        "cause": None if cause is None else cause.member(),
+        "departure_moved_s": None if departure_ms is None else departure_ms / 1000,
+        "arrival_moved_s": None if arrival_ms is None else arrival_ms / 1000,
+        "reason": reason,
+    }
+
+
+def _columns(held: Reservations) -> tuple[IntArray, IntArray, IntArray]:
+    return held.block, held.enter_ms, held.exit_ms
