@@ -92,7 +92,9 @@ NEEDED: Mapping[tuple[str, str], frozenset[str]] = {
 }
 # What the writer works for: these count against an operator's rate.
 RATED = frozenset(
-    (method, path) for method, path in NEEDED if path.startswith("/v1/flight-intents") and method != "GET"
+    (method, path)
+    for method, path in NEEDED
+    if path.startswith(("/v1/flight-intents", "/v1/webhooks")) and method != "GET"
 )
 _PATTERNS = [(method, path, compile_path(path)[0]) for method, path in NEEDED]
 _SPELT_OUT = {path: {method for method, other in NEEDED if other == path} for _, path in NEEDED if "{" not in path}
@@ -168,6 +170,11 @@ class Access:
         if self._rate is not None and route in RATED:
             self._rate.spend(caller.operator)
         return caller
+
+    def overdraw(self, caller: Caller, count: int) -> None:
+        """Let a request that was admitted count as so many more; raises `TooManyRequests`."""
+        if self._rate is not None:
+            self._rate.overdraw(caller.operator, count)
 
     async def _bearer(self, keys: KeyStore, authorizations: Sequence[bytes]) -> Caller:
         token = _token_in(authorizations)

@@ -6,6 +6,7 @@ those that no longer fit are made anew, and all are recorded. A batch displaces 
 """
 
 import asyncio
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +19,15 @@ from anyio import to_thread
 from uuid_utils import uuid7
 
 from app.deconfliction import Deconfliction, Recorded
-from app.errors import BeyondHorizon, DepartureInThePast, IdempotencyKeyReused, ItemRefused, QueueFull
+from app.errors import (
+    BatchNotPlanned,
+    BeyondHorizon,
+    DepartureInThePast,
+    IdempotencyKeyReused,
+    ItemRefused,
+    QueueFull,
+    TooManyRequests,
+)
 from app.flight_intents import FlightIntent, Refusal, Submission
 from app.ledger import Ledger, Transaction
 from app.ledger.queries import IdempotencyRecord
@@ -28,10 +37,15 @@ from planner.cfa_star import Planner, PlanRequest
 from planner.errors import NoPlan
 from planner.occupancy import OccupancyIndex
 from planner.path import Plan, Trajectory
-from planner.together import Figures, Schedule, Together
+from planner.together import Figures, Interrupted, Schedule, Together
 
 # Those that wait for another one to be improved, and that one.
 _MOST_AT_ONCE = 4
+# All other batches wait while one is planned for the first time, and so does a client; hundreds of flights that meet
+# nowhere take a second or two, as many that all want to land on one roof may take minutes.
+_FIRST_COME_WITHIN_S = 20.0
+# Everything else that is written waits while flights are planned under the write lock.
+_AGAIN_WITHIN_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -107,15 +121,24 @@ class _Batch:
 
 
 class Batches:
-    """Plans and records batches, one at a time; for one event loop."""
+    """Plans and records batches, one at a time and each operator's one after another; for one event loop."""
 
-    def __init__(self, writer: Writer, ledger: Ledger, scheduler: Scheduler, deconfliction: Deconfliction) -> None:
+    def __init__(
+        self,
+        writer: Writer,
+        ledger: Ledger,
+        scheduler: Scheduler,
+        deconfliction: Deconfliction,
+        elapsed_s: Callable[[], float] = time.perf_counter,
+    ) -> None:
         self._writer = writer
         self._ledger = ledger
         self._scheduler = scheduler
         self._deconfliction = deconfliction
+        self._elapsed_s = elapsed_s
         self._turn = asyncio.Lock()
-        self._at_once = 0
+        # Whose batches are being planned or wait for that.
+        self._operators: set[str] = set()
 
     async def submit(
         self,
@@ -126,17 +149,22 @@ class Batches:
     ) -> BatchOutcome:
         """Plan submissions of one priority together, and record all of them; stop improving early `is_closing`.
 
+        Whoever is cancelled gives its turn to the next; what is about to be written then may still be recorded.
+
         Raises
         ------
-        ItemRefused, TooManyOpenIntents, IdempotencyKeyReused, QueueFull, LedgerUnavailable
+        ItemRefused, TooManyOpenIntents, IdempotencyKeyReused, BatchNotPlanned, TooManyRequests, QueueFull,
+        LedgerUnavailable
             Nothing was recorded.
         OutcomeUnknown
             The commit was lost, and the ledger cannot be asked.
         """
-        if self._at_once == _MOST_AT_ONCE:
-            raise QueueFull(f"{_MOST_AT_ONCE} batches are being planned or wait for that; try again in some seconds")
         batch = _Batch(submissions, [str(uuid7()) for _ in submissions], key)
-        self._at_once += 1
+        if batch.operator in self._operators:
+            raise TooManyRequests(f"operator {batch.operator!r} has another batch that is being planned: one at a time")
+        if len(self._operators) == _MOST_AT_ONCE:
+            raise QueueFull(f"{_MOST_AT_ONCE} batches are being planned or wait for that; try again in some seconds")
+        self._operators.add(batch.operator)
         try:
             async with self._turn:
                 picture = await self._writer.perform(
@@ -144,7 +172,7 @@ class Batches:
                 )
                 if isinstance(picture, IdempotencyRecord):
                     return await to_thread.run_sync(self._replayed, batch, picture)
-                found = await to_thread.run_sync(self._improved, picture, improve_for_s, is_closing)
+                found = await self._planned(picture, improve_for_s, is_closing)
                 outcome = await self._writer.perform(
                     lambda transaction, now: self._record(transaction, now, batch, found),
                     lambda: self._look_up(batch, found),
@@ -153,13 +181,13 @@ class Batches:
                     return await to_thread.run_sync(self._replayed, batch, outcome)
                 return outcome
         finally:
-            self._at_once -= 1
+            self._operators.remove(batch.operator)
 
     @cached_property
     def _planner(self) -> Planner:
         """A planner of its own, for the writer's serves the writer meanwhile."""
         planner = self._scheduler.planner
-        return Planner(planner.airspace, planner.search, planner.hover_limit_ms)
+        return Planner(planner.airspace, planner.search, planner.hover_limit_ms, planner.detour_limit_ms)
 
     def _picture(
         self, transaction: Transaction, now: int, batch: _Batch, improve_for_s: float
@@ -176,11 +204,38 @@ class Batches:
         ]
         return _Picture(self._scheduler.index.copy(), requests)
 
-    def _improved(self, picture: _Picture, improve_for_s: float, is_closing: Callable[[], bool]) -> _Found:
-        together = Together(self._planner, picture.requests, picture.reserved)
-        began = time.perf_counter()
-        together.improve(lambda: time.perf_counter() - began >= improve_for_s or is_closing())
-        elapsed_s = time.perf_counter() - began
+    async def _planned(self, picture: _Picture, improve_for_s: float, is_closing: Callable[[], bool]) -> _Found:
+        """Plan in a thread. If that is cancelled, tell the thread, and wait for it: the planner is in its hands."""
+        is_cancelled = threading.Event()
+
+        def should_stop() -> bool:
+            return is_cancelled.is_set() or is_closing()
+
+        planning = asyncio.ensure_future(to_thread.run_sync(self._improved, picture, improve_for_s, should_stop))
+        try:
+            return await asyncio.shield(planning)
+        except asyncio.CancelledError:
+            is_cancelled.set()
+            await asyncio.wait([planning])
+            raise
+
+    def _improved(self, picture: _Picture, improve_for_s: float, should_stop: Callable[[], bool]) -> _Found:
+        began = self._elapsed_s()
+        try:
+            together = Together(
+                self._planner,
+                picture.requests,
+                picture.reserved,
+                should_stop=lambda: self._elapsed_s() - began >= _FIRST_COME_WITHIN_S or should_stop(),
+            )
+        except Interrupted:
+            raise BatchNotPlanned(
+                f"{len(picture.requests)} flight intents were not planned within {_FIRST_COME_WITHIN_S:g} s, or the "
+                "service is about to stop"
+            ) from None
+        began = self._elapsed_s()
+        together.improve(lambda: self._elapsed_s() - began >= improve_for_s or should_stop())
+        elapsed_s = self._elapsed_s() - began
         stopped_by = "optimal" if together.is_best_possible else "shutdown" if elapsed_s < improve_for_s else "time"
         return _Found(together.first_come, together.best, Improvement(together.iterations, elapsed_s, stopped_by))
 
@@ -220,7 +275,8 @@ class Batches:
     ) -> list[Plan | Refusal]:
         """Reserve the plans that still hold, then plan the other flights around all of those, in their order.
 
-        They are recorded right after this, so it is known which sequence numbers they will have.
+        They are recorded right after this, so it is known which sequence numbers they will have. Raises
+        `BatchNotPlanned` if there are more to plan than others can wait for; then the index is as it was.
         """
         index = self._scheduler.index
         first = transaction.sequence + 1
@@ -230,10 +286,16 @@ class Batches:
                 index.reserve(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms, first + number)
                 settled[number] = plan
         mates = dict(enumerate(batch.ids, start=first))
+        began = self._elapsed_s()
         for number, submission in enumerate(batch.submissions):
             if settled[number] is None:
+                if self._elapsed_s() - began >= _AGAIN_WITHIN_S:
+                    for outcome in settled:
+                        if isinstance(outcome, Plan):
+                            index.release(outcome.hold_block, outcome.hold_enter_ms, outcome.hold_exit_ms)
+                    raise BatchNotPlanned("others have reserved too much of what the batch was planned to fly in")
                 try:
-                    plan = self._scheduler.planner.plan(self._scheduler.request(submission, now))
+                    plan = self._scheduler.planner.plan(self._scheduler.request(submission, now), outlook=False)
                 except NoPlan as error:
                     settled[number] = _refusal(error, transaction, mates)
                 else:

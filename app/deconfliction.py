@@ -134,39 +134,25 @@ class Deconfliction:
             The commit was lost, and the ledger cannot be asked.
         """
         intent_id = str(uuid7())
+        # What the last attempt did, which is what was done if the intent is in the ledger.
+        done: list[Outcome] = []
+
+        def run(transaction: Transaction, now: int) -> Outcome:
+            done[:] = [self._submit(transaction, now, intent_id, submission, key)]
+            return done[0]
 
         def look_up() -> Outcome | None:
-            intent = self._ledger.find(intent_id)
-            if intent is not None:
-                return Outcome(intent, self._made_way(intent))
+            if done and self._ledger.find(intent_id) is not None:
+                return done[0]
             first = None if key is None else self._ledger.answer_to(submission.operator, key.key)
             if key is None or first is None or first.body_digest != key.body_digest:
                 return None
             return Outcome(first.intent, replayed=first.answer)
 
-        request = self._writer.enqueue(
-            lambda transaction, now: self._submit(transaction, now, intent_id, submission, key), look_up, plans=True
-        )
+        request = self._writer.enqueue(run, look_up, plans=True)
         outcome = await asyncio.wrap_future(request.future)
         queue_s, plan_s = request.begun - request.arrived, request.ended - request.begun
         return replace(outcome, timing=Timing(queue_s, plan_s, time.perf_counter() - request.ended))
-
-    def _made_way(self, intent: FlightIntent) -> tuple[Displacement, ...]:
-        """Return who made way for an intent when it got its version, as the journal tells."""
-        entries = self._ledger.journal_after(intent.version - 1, 1)
-        return tuple(
-            Displacement(
-                entry.sequence,
-                entry.intent_id,
-                self._ledger.operator_of(entry.intent_id) or "",
-                State(entry.kind),
-                _ms_of(entry.details["departure_moved_s"]),
-                _ms_of(entry.details["arrival_moved_s"]),
-                entry.details["reason"],
-            )
-            for entry in entries
-            if entry.details.get("cause") == Cause(flight_intent_id=intent.id).member()
-        )
 
     async def preview(self, submission: Submission) -> PreviewPlan | Refusal:
         """Plan a submission, record nothing; raises as `submit`."""
@@ -196,13 +182,18 @@ class Deconfliction:
             Nothing was changed.
         """
 
-        def look_up() -> Outcome | Refusal | None:
-            intent = self._ledger.find(intent_id)
-            is_done = intent is not None and intent.submission == submission and intent.version not in (versions or ())
-            return Outcome(intent, self._made_way(intent)) if intent is not None and is_done else None
+        done: list[Outcome | Refusal] = []
 
         def run(transaction: Transaction, now: int) -> Outcome | Refusal:
-            return self._change(transaction, now, intent_id, submission, versions)
+            done[:] = [self._change(transaction, now, intent_id, submission, versions)]
+            return done[0]
+
+        def look_up() -> Outcome | Refusal | None:
+            outcome, found = done[0] if done else None, self._ledger.find(intent_id)
+            if isinstance(outcome, Outcome):
+                is_done = found is not None and found.version == outcome.intent.version
+                return outcome if is_done else None
+            return outcome
 
         return await self._writer.perform(run, look_up, plans=True)
 
@@ -355,7 +346,7 @@ class Deconfliction:
                 trajectory=plan,
                 reservations=reservations(plan),
             )
-            scheduler.reserve(intent)
+            scheduler.reserve(intent, now)
             return Outcome(intent, scheduler.settle(transaction, now, vacated, Cause(flight_intent_id=intent.id)))
 
     def _change(
@@ -395,7 +386,7 @@ class Deconfliction:
         with transaction.one_revision():
             vacated = scheduler.vacate(transaction, now, [before.sequence, *scheduler.in_the_way(plan, before)])
             after = transaction.rewrite(before, after, now, details_of(before, after))
-            scheduler.reserve(after)
+            scheduler.reserve(after, now)
             others = [intent for intent in vacated if intent.sequence != before.sequence]
             return Outcome(after, scheduler.settle(transaction, now, others, Cause(flight_intent_id=after.id)))
 
@@ -487,10 +478,6 @@ def _found(transaction: Transaction, intent_id: str) -> FlightIntent:
     if intent is None:
         raise UnknownFlightIntent(f"there is no flight intent {intent_id}")
     return intent
-
-
-def _ms_of(seconds: float | None) -> int | None:
-    return None if seconds is None else round(seconds * 1000)
 
 
 def log_intents(report: BatchReport) -> None:

@@ -6,6 +6,7 @@ RequestError                 answered as a problem; `app.problems` maps every on
 ├── BeyondHorizon            departure later than plans are made
 ├── UnknownFlightIntent      no intent of that id
 ├── ItemRefused              an item of a batch, for which the whole batch is refused
+├── BatchNotPlanned          a batch for which there was not enough time
 ├── UnknownBlock             no block of those indices
 ├── UnknownConstraint        no constraint of that id
 ├── TooManyConstraints       as many constraints are in force, or to come, as there may be
@@ -41,6 +42,7 @@ RequestError                 answered as a problem; `app.problems` maps every on
 ├── TooManyRequests          more requests a second than an operator may make
 ├── TooManyOpenIntents       more flights that are not over than an operator may have
 ├── HostNotAllowed           a Host header that is not loopback, while there is no authentication
+├── CrossSiteRequest         another site's page asks for a change, while there is no authentication
 ├── QueueFull                more requests are waiting than allowed; nothing was taken
 ├── LedgerUnavailable        the ledger failed; nothing was recorded
 ├── OutcomeUnknown           the commit was lost, and the ledger cannot be asked what became of it
@@ -85,6 +87,10 @@ class ItemRefused(RequestError):
         super().__init__(f"flight_intents[{index}]: {cause}")
         self.index = index
         self.cause = cause
+
+
+class BatchNotPlanned(RequestError):
+    """There was not enough time to plan the batch; nothing was recorded."""
 
 
 class UnknownBlock(RequestError):
@@ -241,6 +247,10 @@ class TooManyOpenIntents(RequestError):
 
 class HostNotAllowed(RequestError):
     """Without authentication only loopback Host headers are answered."""
+
+
+class CrossSiteRequest(RequestError):
+    """A browser asks for a change on behalf of another site's page."""
 
 
 class QueueFull(RequestError):

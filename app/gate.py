@@ -1,4 +1,4 @@
-"""What every request passes first: the Host header, who asks, the body's size and time, and how much is going on."""
+"""What every request passes first: Host and Origin, who asks, the body's size and time, and how much is going on."""
 
 import asyncio
 
@@ -9,6 +9,7 @@ from app import problems
 from app.addresses import host_of, is_loopback
 from app.errors import (
     BodyTooLarge,
+    CrossSiteRequest,
     HostNotAllowed,
     MalformedRequest,
     RequestError,
@@ -31,6 +32,9 @@ _LAST = (RequestTimedOut, TooManyConnections)
 # A name has up to 253, and then there is the port.
 _HOST_LENGTH = 260
 _WITH_BODY = ("POST", "PUT")
+_READS = ("GET", "HEAD", "OPTIONS")
+# What browsers say of requests by a site's own pages, and of those that nobody's page makes.
+_OWN_SITE = ("same-origin", "none")
 # More digits than any length has.
 _LENGTH_DIGITS = 15
 
@@ -52,6 +56,7 @@ class Gate:
             if scope["state"].get(SURPLUS, False):
                 raise TooManyConnections("this process has as many connections as it may")
             self._check_host(scope)
+            self._check_site(scope)
             service: Service = scope["state"]["service"]
             await service.access.admit(scope)
             body = await self._body(scope, receive)
@@ -99,6 +104,19 @@ class Gate:
         if not is_open and not is_loopback(host_of(header)):
             raise HostNotAllowed(f"Host {header!r} is not a loopback host, and there is no authentication")
 
+    def _check_site(self, scope: Scope) -> None:
+        """Refuse changes that pages of other sites ask for: what has no body browsers send without asking first."""
+        if self._settings.jwks is not None or scope["method"] in _READS:
+            return
+        headers = Headers(scope=scope)
+        sites, origins = headers.getlist("sec-fetch-site"), headers.getlist("origin")
+        is_own = all(site in _OWN_SITE for site in sites)
+        if not sites:
+            # Browsers say it only to whom they trust.
+            is_own = all(_is_own(origin, headers.get("host", "")) for origin in origins)
+        if not is_own:
+            raise CrossSiteRequest("a page of another site asks for a change, and there is no authentication")
+
     async def _body(self, scope: Scope, receive: Receive) -> bytes:
         within_s = self._settings.body_timeout_s
         try:
@@ -133,6 +151,12 @@ class Gate:
         if too_large:
             raise BodyTooLarge(f"bodies may have up to {limit} bytes")
         return b"".join(chunks)
+
+
+def _is_own(origin: str, host: str) -> bool:
+    """Tell whether a page comes from this machine, or from where its request goes to."""
+    place = origin.partition("://")[2]
+    return is_loopback(host_of(place)) or (place != "" and place.lower() == host.lower())
 
 
 def _check_media_type(scope: Scope) -> None:

@@ -120,6 +120,7 @@ class KeyStore:
     def __init__(self, place: str, refresh_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._place = place
         self._is_address = _is_address(place)
+        self._shown = _without_query(place) if self._is_address else place
         self._refresh_s = refresh_s
         self._monotonic = monotonic
         self._tried_s = monotonic()
@@ -130,7 +131,7 @@ class KeyStore:
         try:
             self._keys = self._read()
         except UnusableKeys as error:
-            raise StartupError(f"AIRMATRIX_JWKS, {place}: {error}") from error
+            raise StartupError(f"AIRMATRIX_JWKS, {self._shown}: {error}") from error
 
     def start(self) -> None:
         """Ask an address again from time to time."""
@@ -198,11 +199,11 @@ class KeyStore:
         except Exception as error:
             # Whatever is wrong there: with the keys that are known, tokens can be verified.
             with suppress(OSError, ValueError):
-                log.warning("keys could not be read again; those known stay in use", jwks=self._place, error=str(error))
+                log.warning("keys could not be read again; those known stay in use", jwks=self._shown, error=str(error))
             return
         if keys.keys() != self._keys.keys():
             with suppress(OSError, ValueError):
-                log.info("keys have changed", jwks=self._place, ids=list(keys))
+                log.info("keys have changed", jwks=self._shown, ids=list(keys))
         self._keys = keys
 
     def _read(self) -> Keys:
@@ -216,15 +217,27 @@ def store_of(settings: Settings) -> KeyStore | None:
 
 def _is_address(place: str) -> bool:
     """Tell an address from a file's path; raises `StartupError` for one that strangers could answer for."""
-    if "://" not in place:
+    scheme, is_address, _ = place.partition("://")
+    if not is_address:
         return False
     try:
         url = httpx.URL(place)
-    except httpx.InvalidURL as error:
-        raise StartupError(f"AIRMATRIX_JWKS, {place}: {error}") from error
-    if not url.host or not (url.scheme == "https" or (url.scheme == "http" and is_loopback(url.host))):
-        raise StartupError(f"AIRMATRIX_JWKS, {place}: keys are fetched by https, or by http from loopback only")
+        host = url.host
+    except (httpx.InvalidURL, UnicodeError):
+        # Not what it is nor where it is wrong: there may be a password in it.
+        raise StartupError(f"AIRMATRIX_JWKS, {scheme}://…: cannot be parsed") from None
+    if url.userinfo:
+        raise StartupError(f"AIRMATRIX_JWKS, {_without_query(place)}: keys are public; give no user or password")
+    if not host or not (url.scheme == "https" or (url.scheme == "http" and is_loopback(host))):
+        raise StartupError(
+            f"AIRMATRIX_JWKS, {_without_query(place)}: keys are fetched by https, or by http from loopback only"
+        )
     return True
+
+
+def _without_query(address: str) -> str:
+    """Return of an address what may be shown: a query, a user or a password may be secret."""
+    return str(httpx.URL(address).copy_with(username="", password="", query=None, fragment=None))
 
 
 def _read_file(path: str) -> bytes:

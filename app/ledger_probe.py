@@ -2,10 +2,15 @@
 
 import asyncio
 from concurrent.futures import Future
+from contextlib import suppress
 from threading import Thread
+
+import structlog
 
 from app.errors import LedgerUnavailable
 from app.ledger import Ledger
+
+log = structlog.get_logger()
 
 _PATIENCE_S = 2.0
 
@@ -23,7 +28,10 @@ class LedgerProbe:
         self._asked: Future[int] | None = None
 
     async def revision(self) -> int:
-        """Return the ledger's newest revision; `LedgerUnavailable` if it cannot be read, or not in time."""
+        """Return the ledger's newest revision; `LedgerUnavailable` if it cannot be read, or not in time.
+
+        Why it cannot be read is only logged: health is everybody's to see, and where the ledger is is not.
+        """
         if self._asked is None or self._asked.done():
             asked: Future[int] = Future()
             Thread(target=self._ask, args=(asked,), name="ledger-probe", daemon=True).start()
@@ -39,5 +47,9 @@ class LedgerProbe:
     def _ask(self, asked: "Future[int]") -> None:
         try:
             asked.set_result(self._ledger.revision())
+        except LedgerUnavailable as error:
+            with suppress(OSError, ValueError):
+                log.warning("the ledger did not answer a health check", error=str(error))
+            asked.set_exception(LedgerUnavailable("the ledger cannot be read"))
         except Exception as error:
             asked.set_exception(error)

@@ -27,6 +27,22 @@ class RateLimit:
 
     def spend(self, operator: str | None) -> None:
         """Take a request of an operator (None: of whom nobody knows) into account; raises `TooManyRequests`."""
+        bucket = self._bucket(operator)
+        if bucket.tokens < 1:
+            raise self._refusal(operator, bucket)
+        bucket.tokens -= 1
+
+    def overdraw(self, operator: str | None, count: int) -> None:
+        """Take into account that a request that has passed is worth so many more: the operator waits for them
+        afterwards. Raises `TooManyRequests` where it has to wait for others already.
+        """
+        bucket = self._bucket(operator)
+        if bucket.tokens < 0:
+            raise self._refusal(operator, bucket)
+        bucket.tokens -= count
+
+    def _bucket(self, operator: str | None) -> _Bucket:
+        """Return an operator's bucket as it is now."""
         now = self._elapsed_ms()
         bucket = self._buckets.get(operator)
         if bucket is None:
@@ -34,12 +50,13 @@ class RateLimit:
             bucket = self._buckets[operator] = _Bucket(self._burst, now)
         bucket.tokens = self._filled(bucket, now)
         bucket.filled_ms = now
-        if bucket.tokens < 1:
-            whose = "" if operator is None else f" of operator {operator!r}"
-            raise TooManyRequests(
-                f"more than {self._per_s:g} requests a second{whose}", math.ceil((1 - bucket.tokens) / self._per_s)
-            )
-        bucket.tokens -= 1
+        return bucket
+
+    def _refusal(self, operator: str | None, bucket: _Bucket) -> TooManyRequests:
+        whose = "" if operator is None else f" of operator {operator!r}"
+        return TooManyRequests(
+            f"more than {self._per_s:g} requests a second{whose}", math.ceil((1 - bucket.tokens) / self._per_s)
+        )
 
     def _filled(self, bucket: _Bucket, now: int) -> float:
         return min(self._burst, bucket.tokens + (now - bucket.filled_ms) / 1000 * self._per_s)

@@ -79,6 +79,8 @@ def create_app(
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
+        # Redirects would be built from the Host header, which says what its sender likes.
+        redirect_slashes=False,
         dependencies=[Depends(auth.admitted)],
     )
     for resource in (

@@ -88,6 +88,10 @@ KINDS: dict[type[Exception], Kind] = {
         "item-refused", 422, "An item of the batch is refused, and the batch with it",
         "Nothing was recorded. `cause` says what is wrong with the item at `index`; correct or leave it out.",
     ),
+    errors.BatchNotPlanned: Kind(
+        "batch-not-planned", 503, "There was not enough time to plan the batch",
+        "Nothing was recorded. Send fewer flight intents at once, or the same later.",
+    ),
     errors.IllegalTransition: Kind(
         "illegal-transition", 409, "The flight intent's state does not allow this", "Read the intent's state first."
     ),
@@ -175,6 +179,10 @@ KINDS: dict[type[Exception], Kind] = {
         "host-not-allowed", 421, "Host not served here",
         "Without authentication only loopback hosts are answered; use 127.0.0.1 or localhost.",
     ),
+    errors.CrossSiteRequest: Kind(
+        "cross-site-request", 403, "Asked for by another site's page",
+        "Without authentication only this service's own pages, and programs, may change anything.",
+    ),
     errors.QueueFull: Kind("queue-full", 503, "Too many requests are waiting", "Wait `Retry-After` seconds."),
     errors.LedgerUnavailable: Kind(
         "ledger-unavailable", 503, "The ledger is unavailable", "Nothing was recorded. Try again later."
@@ -196,6 +204,9 @@ HTTP_ERRORS = {
 }
 INTERNAL = Kind("internal-error", 500, "Internal error", "Report `error_id`; the log has the details.")
 
+
+# So many things that are wrong with a body are told; who sends more of them has hardly read as many.
+MOST_ERRORS = 100
 
 # What a body of several forms is told apart by stands in the place of an error like a member; it is none.
 FORMS = (":planned", ":trajectory", ":volumes")
@@ -263,6 +274,7 @@ def response(
 
 def response_to(error: Exception) -> Response:
     """Return the response to a domain error."""
+    kind = kind_of(error)
     members: dict[str, Any] = {}
     if isinstance(error, NotPlannable):
         members["reason"] = error.reason
@@ -280,7 +292,8 @@ def response_to(error: Exception) -> Response:
         members["needed_scopes"] = error.needed
     if isinstance(error, errors.ItemRefused):
         members |= {"index": error.index, "cause": orjson.Fragment(response_to(error.cause).body)}
-    return response(kind_of(error), str(error), members, _headers(error))
+        kind = replace(kind, status=kind_of(error.cause).status)
+    return response(kind, str(error), members, _headers(error))
 
 
 def _headers(error: Exception) -> dict[str, str]:
@@ -315,6 +328,16 @@ def refusal_body(
     return body(KINDS[kind], refusal.detail, members | dict(more or {}))
 
 
+def with_one_unknown(document: object, model: type[BaseModel]) -> object:
+    """Return a document without the members that a model does not know, but for the first: it is refused for that one
+    already, and naming each of a hundred thousand would keep everybody waiting.
+    """
+    if not isinstance(document, dict) or document.keys() <= model.model_fields.keys():
+        return document
+    unknown = next(name for name in document if name not in model.model_fields)
+    return {name: value for name, value in document.items() if name == unknown or name in model.model_fields}
+
+
 def install(app: FastAPI) -> None:
     """Answer every error with a problem."""
 
@@ -323,19 +346,21 @@ def install(app: FastAPI) -> None:
 
     async def validation_error(_: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
+        all_errors = error.errors()
         found = [
             {
                 "loc": [part for part in item["loc"] if part not in FORMS],
                 "msg": item["msg"].removeprefix("Value error, "),
                 "type": item["type"],
             }
-            for item in error.errors()
+            for item in all_errors[:MOST_ERRORS]
         ]
+        members = {"errors": found, "error_count": len(all_errors)}
         if any(item["type"] == "json_invalid" for item in found):
-            return response(KINDS[errors.MalformedRequest], "the body is not valid JSON", {"errors": found})
+            return response(KINDS[errors.MalformedRequest], "the body is not valid JSON", members)
         first = f"{'.'.join(str(part) for part in found[0]['loc'])}: {found[0]['msg']}"
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        return response(VALIDATION, first + more, {"errors": found})
+        more = f" (and {len(all_errors) - 1} more)" if len(all_errors) > 1 else ""
+        return response(VALIDATION, first + more, members)
 
     async def http_error(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)

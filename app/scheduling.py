@@ -25,6 +25,8 @@ from planner.submitted import PathConflicts, SubmittedPath, conflicts
 
 # A departure window may have opened before the intent came, but not longer ago than this.
 _OPEN_FOR_MS = 86_400_000
+# Up to so many flights that make way are each worth a second search.
+_FEW = 16
 
 
 class AircraftTypeGone(NoPlan):
@@ -33,14 +35,23 @@ class AircraftTypeGone(NoPlan):
     reason = "aircraft_type_gone"
 
 
+class TooManyAtOnce(NoPlan):
+    """So many flights had to make way at once that there was no time to plan this one again."""
+
+    reason = "too_many_at_once"
+
+
 @dataclass(frozen=True)
-class Periods:
+class Limits:
     """How far ahead flights may depart, how long before its departure a flight can no longer be moved, and from how
-    soon on a flight in the air can be planned anew: in ms."""
+    soon on a flight in the air can be planned anew: in ms. After how many expansions of the search flights that have to
+    make way are no longer planned again: some seconds' work.
+    """
 
     horizon_ms: int
     notice_ms: int = 60_000
     lead_ms: int = 5_000
+    most_expansions: int = 3_000_000
 
 
 @dataclass(frozen=True)
@@ -65,10 +76,10 @@ class Cause:
 class Scheduler:
     """Plans flights, and moves those that have to make way. Changes the planner's index as it changes the ledger."""
 
-    def __init__(self, planner: Planner, performances: Mapping[str, Performance], periods: Periods) -> None:
+    def __init__(self, planner: Planner, performances: Mapping[str, Performance], limits: Limits) -> None:
         self.planner = planner
         self._performances = performances
-        self._periods = periods
+        self._limits = limits
 
     @property
     def index(self) -> OccupancyIndex:
@@ -130,7 +141,7 @@ class Scheduler:
         needed = holds_of(self.planner.airspace, path.block, path.arrive_ms, path.depart_ms)
         if not all(map(np.array_equal, needed, _columns(own.reservations))):
             raise NotChangeable("the flight is in the air and flies in volumes: nobody knows where it will be")
-        from_ms = max(now + self._periods.lead_ms, path.departure_ms + path.terminal_dwell_ms)
+        from_ms = max(now + self._limits.lead_ms, path.departure_ms + path.terminal_dwell_ms)
         index = self._unyielding(transaction, now, submission, own)
         for place in range(int(np.searchsorted(path.depart_ms, from_ms)), len(path.block) - 1):
             block, start_ms = int(path.block[place]), max(int(path.arrive_ms[place]), from_ms)
@@ -144,16 +155,22 @@ class Scheduler:
                 performance = self._performances[submission.aircraft_type]
                 request = PlanRequest(block, submission.destination_block, performance, start_ms, start_ms)
                 return self.planner.continued(flown, request, index)
-        raise IllegalTransition(f"flight intent {own.id} is about to land, and can no longer be planned anew")
+        raise IllegalTransition(
+            f"flight intent {own.id} is about to land, or leaves closed airspace only where it lands: "
+            "it can no longer be planned anew"
+        )
 
     def in_the_way(self, plan: Plan, own: FlightIntent | None = None) -> tuple[int, ...]:
         """Return the sequence numbers of the flights that would have to make way for a plan."""
         owners = self.index.owners_within(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
-        return tuple(owner for owner in owners if own is None or owner != own.sequence)
+        return tuple(owner for owner in owners if owner > 0 and (own is None or owner != own.sequence))
 
     def within(self, transaction: Transaction, now: int, closure: Closure) -> "Hit":
         """Return the flights that hold, from now on, some of what is to be closed."""
-        owners = self.index.owners_within(closure.block, np.maximum(closure.enter_ms, now), closure.exit_ms)
+        to_come = closure.exit_ms > now
+        owners = self.index.owners_within(
+            closure.block[to_come], np.maximum(closure.enter_ms, now)[to_come], closure.exit_ms[to_come]
+        )
         movable = set(self._movable(transaction, now, None).tolist())
         flights = [owner for owner in owners if owner > 0]
         return Hit(
@@ -176,51 +193,45 @@ class Scheduler:
     ) -> tuple[Displacement, ...]:
         """Plan vacated flights again, by priority and then by sequence; who finds no place is displaced.
 
-        They depart after their operators have had notice.
+        They depart after their operators have had notice. The write lock is held meanwhile: beyond an amount of work,
+        those that are left are displaced, and can be changed one by one.
         """
-        return tuple(
-            self._settle(transaction, now, intent, cause)
-            for intent in sorted(vacated, key=lambda intent: (-intent.submission.priority, intent.sequence))
+        displaced, spent = [], 0
+        for intent in sorted(vacated, key=lambda intent: (-intent.submission.priority, intent.sequence)):
+            reason: str | None = None
+            try:
+                if spent > self._limits.most_expansions:
+                    raise TooManyAtOnce("too many flights had to make way at once to plan all of them again")
+                # Where many have to make way, nobody looks for when else those could fly who find no place.
+                request = self.request(intent.submission, now + self._limits.notice_ms)
+                plan = self.planner.plan(request, outlook=len(vacated) <= _FEW)
+            except NoPlan as error:
+                spent += error.expansions
+                after = self._displaced(transaction, intent, error, cause)
+                reason = error.reason
+            else:
+                spent += plan.expansions
+                after = replace(intent, trajectory=plan, reservations=reservations(plan))
+            transaction.rewrite(intent, after, now, details_of(intent, after, cause, reason))
+            self.reserve(after, now)
+            operator, moved = intent.submission.operator, moved_ms(intent, after)
+            displaced.append(Displacement(intent.sequence, intent.id, operator, after.state, *moved, reason))
+        return tuple(displaced)
+
+    def reserve(self, intent: FlightIntent, now: int) -> None:
+        """Bring what an intent still holds into the index."""
+        self.index.reserve(*_columns(intent.reservations.beyond(now)), intent.sequence)
+
+    def _displaced(self, transaction: Transaction, intent: FlightIntent, error: NoPlan, cause: Cause) -> FlightIntent:
+        """Return a vacated flight for which there is no plan."""
+        told = refusal(error, transaction)
+        return replace(
+            intent,
+            state=State.DISPLACED,
+            trajectory=None,
+            reservations=Reservations.none(),
+            refusal=replace(told, detail=f"displaced by {cause}, and then: {told.detail}"),
         )
-
-    def reserve(self, intent: FlightIntent) -> None:
-        """Bring what an intent holds into the index."""
-        self.index.reserve(*_columns(intent.reservations), intent.sequence)
-
-    def _settle(self, transaction: Transaction, now: int, intent: FlightIntent, cause: Cause) -> Displacement:
-        try:
-            plan = self.planner.plan(self.request(intent.submission, now + self._periods.notice_ms))
-        except NoPlan as error:
-            told = refusal(error, transaction)
-            detail = f"displaced by {cause}, and then: {told.detail}"
-            after = replace(
-                intent,
-                state=State.DISPLACED,
-                trajectory=None,
-                reservations=Reservations.none(),
-                refusal=replace(told, detail=detail),
-            )
-            self._rewrite(transaction, now, intent, after, cause, error.reason)
-            return Displacement(
-                intent.sequence, intent.id, intent.submission.operator, State.DISPLACED, reason=error.reason
-            )
-        after = replace(intent, trajectory=plan, reservations=reservations(plan))
-        self._rewrite(transaction, now, intent, after, cause)
-        return Displacement(
-            intent.sequence, intent.id, intent.submission.operator, intent.state, *moved_ms(intent, after)
-        )
-
-    def _rewrite(
-        self,
-        transaction: Transaction,
-        now: int,
-        before: FlightIntent,
-        after: FlightIntent,
-        cause: Cause,
-        reason: str | None = None,
-    ) -> None:
-        transaction.rewrite(before, after, now, details_of(before, after, cause, reason))
-        self.reserve(after)
 
     def _unyielding(
         self, transaction: Transaction, now: int, submission: Submission, own: FlightIntent | None
@@ -232,7 +243,7 @@ class Scheduler:
         return self.index.without(np.array(gone, dtype=np.int64)) if gone else self.index
 
     def _movable(self, transaction: Transaction, now: int, priority_below: int | None) -> IntArray:
-        return transaction.movable(priority_below, now + self._periods.notice_ms)
+        return transaction.movable(priority_below, now + self._limits.notice_ms)
 
     def request(self, submission: Submission, from_ms: int) -> PlanRequest:
         """Return what to ask of the planner for a departure at a time or later; raises `AircraftTypeGone`."""
@@ -259,7 +270,7 @@ class Scheduler:
                 f"the earliest departure, {format_time(submission.earliest_departure_ms)}, is more than a day ago; "
                 f"it is {format_time(now)}"
             )
-        horizon = now + self._periods.horizon_ms
+        horizon = now + self._limits.horizon_ms
         if submission.latest_departure_ms > horizon:
             raise BeyondHorizon(f"flights can be planned to depart until {format_time(horizon)}; submit this one later")
 

@@ -24,7 +24,7 @@ from app.ledger_probe import LedgerProbe
 from app.metrics import Metrics
 from app.monitor import Monitor
 from app.replica import OccupancyReplica
-from app.scheduling import Periods, Scheduler
+from app.scheduling import Limits, Scheduler
 from app.settings import Settings
 from app.telemetry import Telemetry
 from app.times import monotonic_ms
@@ -259,7 +259,9 @@ def _writing(
 ) -> Writing:
     settings = basis.settings
     warm_up()
-    planner = Planner(basis.airspace, settings.search, int(settings.hover_limit_s * 1000))
+    planner = Planner(
+        basis.airspace, settings.search, int(settings.hover_limit_s * 1000), int(settings.detour_limit_s * 1000)
+    )
     policy = Policy(
         idempotency_ms=int(settings.idempotency_hours * 3_600_000),
         queue_limit=settings.queue_limit,
@@ -275,12 +277,12 @@ def _writing(
         observers=(log_intents, metrics.batch),
         on_death=on_death,
     )
-    periods = Periods(
+    limits = Limits(
         horizon_ms=int(settings.horizon_days * 86_400_000),
         notice_ms=int(settings.notice_s * 1000),
         lead_ms=int(settings.replan_lead_s * 1000),
     )
-    scheduler = Scheduler(planner, basis.performances(), periods)
+    scheduler = Scheduler(planner, basis.performances(), limits)
     deconfliction = Deconfliction(
         writer, ledger, scheduler, _thresholds(settings).freshness_ms, settings.open_intents_limit
     )

@@ -43,6 +43,8 @@ class Settings(BaseSettings):
 
     search: Search = Search.SAFE_INTERVAL
     hover_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 60.0
+    # How much longer than without traffic a flight may be in the air.
+    detour_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 300.0
     ground_hold_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 300.0
     # So long before its departure a flight is no longer moved for others.
     notice_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 60.0

@@ -1,12 +1,10 @@
 """What every request leaves behind: its id in the answer and the logs, a line in the log, counts in the metrics."""
 
 import re
-from collections.abc import Mapping
 from contextlib import suppress
 from time import perf_counter
-from typing import Any
+from typing import NamedTuple
 
-import orjson
 import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uuid_utils import uuid7
@@ -20,9 +18,21 @@ log = structlog.get_logger()
 
 _HEADER = b"x-request-id"
 _ID = re.compile(rb"[A-Za-z0-9._:-]{1,100}")
+# How `app.problems` begins every document. What comes after may be long.
+_TEXT = rb'"(?:[^"\\]|\\.)*+"'
+_PROBLEM = re.compile(
+    rb'\{"type":"/problems/([^"]+)","title":%b,"status":\d+,"detail":%b(?:,"reason":"([^"]*)")?' % (_TEXT, _TEXT)
+)
 _IS_PROBLEM = (b"content-type", MEDIA_TYPE.encode())
 # Shedding load must not fill a disk with lines about it; the metrics count it.
 _SHED = {KINDS[error].slug for error in (QueueFull, TooManyConnections, TooManyStreams)}
+
+
+class _Problem(NamedTuple):
+    """What kind of problem an answer was, and its reason if it has one."""
+
+    slug: str
+    reason: str | None
 
 
 class _Answer:
@@ -33,7 +43,7 @@ class _Answer:
         self._request_id = request_id
         self._is_problem = False
         self.status: int | None = None
-        self.problem: Mapping[str, Any] | None = None
+        self.problem: _Problem | None = None
 
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":
@@ -42,7 +52,7 @@ class _Answer:
             message["headers"] = [*message["headers"], (_HEADER, self._request_id)]
         elif self._is_problem:
             # Whoever made it, it is counted as its reader sees it.
-            self.problem = orjson.loads(message["body"])
+            self.problem = _problem_in(message["body"])
         await self._send(message)
 
 
@@ -79,6 +89,14 @@ def _id_of(scope: Scope) -> bytes:
     return str(uuid7()).encode()
 
 
+def _problem_in(body: bytes) -> _Problem | None:
+    begun = _PROBLEM.match(body)
+    if begun is None:
+        return None
+    slug, reason = begun.groups()
+    return _Problem(slug.decode(), None if reason is None else reason.decode())
+
+
 def _note_waiting(service: Service) -> None:
     if not service.is_read_only:
         service.metrics.waiting(service.writer.waiting)
@@ -92,8 +110,8 @@ def _note_answer(service: Service, scope: Scope, answer: _Answer, seconds: float
     service.metrics.answered(method, route, answer.status, seconds)
     details = {}
     if answer.problem is not None:
-        details["problem"] = slug = answer.problem["type"].rpartition("/")[2]
-        service.metrics.problem(slug, answer.problem.get("reason"))
+        details["problem"] = answer.problem.slug
+        service.metrics.problem(*answer.problem)
     write = log.warning if answer.status >= 500 and details.get("problem") not in _SHED else log.debug
     # A log that cannot be written is no reason to break off an answer.
     with suppress(OSError, ValueError):

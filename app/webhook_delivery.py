@@ -9,7 +9,7 @@ import asyncio
 import random
 import socket
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -41,8 +41,10 @@ _DESK_MS, _MARGIN_MS = 20_000, 7_000
 _LINES, _MOST_WAITING = 256, 10_000
 # That nothing was for somebody is recorded only so often.
 _RECORD_READ_MS = 60_000
-# How many events are on their way at once to one webhook; to one that fails; and to all.
-_LANES, _LANES_IF_FAILING, _MOST_LANES = 4, 1, 64
+# How many events are on their way at once to one webhook; to one that fails; to all of an operator; and to all.
+_LANES, _LANES_IF_FAILING, _LANES_OF_OPERATOR, _MOST_LANES = 4, 1, 16, 64
+# For how long a lane is kept while others wait for one.
+_TURN_MS = 1_000
 # Until the thread has let go of what it does.
 _STOP_S = 1.0
 
@@ -90,9 +92,10 @@ class Post:
         url = self._destinations.check(text)
         host = url.raw_host.decode()
         addresses = await _addresses(host, url.port or (443 if url.scheme == "https" else 80))
-        if not all(self._destinations.permits(url, address) for address in addresses):
-            # Not which: names of the network behind this machine are not the operator's to look up.
-            raise WebhookRefused(f"{host} has an address that is not public")
+        if not addresses or not all(self._destinations.permits(url, address) for address in addresses):
+            # Not which, nor whether there is one: names of the network behind this machine are not the operator's to
+            # look up.
+            raise DeliveryFailed(f"{host} has no address, or one that nothing may be sent to")
         # To the very address that was looked at: a second look-up might say something else (DNS rebinding). A proxy
         # would look it up again.
         request = {**headers, "Host": url.netloc.decode(), "User-Agent": self._name}
@@ -114,7 +117,10 @@ async def _exchange(
 
 
 async def _addresses(host: str, port: int) -> Sequence[str]:
-    """Return a host's addresses. In a thread that nobody has to wait for: a resolver may hang longer than we."""
+    """Return a host's addresses, none if it cannot be resolved.
+
+    In a thread that nobody has to wait for: a resolver may hang longer than we.
+    """
     found: Future[list[str]] = Future()
 
     def look_up() -> None:
@@ -122,8 +128,8 @@ async def _addresses(host: str, port: int) -> Sequence[str]:
         try:
             answers = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
             found.set_result(list(dict.fromkeys(str(answer[4][0]) for answer in answers)))
-        except (OSError, UnicodeError) as error:
-            found.set_exception(DeliveryFailed(f"{host} cannot be resolved: {error}"))
+        except (OSError, UnicodeError):
+            found.set_result([])
 
     threading.Thread(target=look_up, name="webhook-resolver", daemon=True).start()
     return await asyncio.wrap_future(found)
@@ -159,7 +165,10 @@ class Deliverer:
         self._recorded_ms = 0
         # By webhook: of which flight intents an event is on its way, and what is under way.
         self._sending: defaultdict[int, set[int]] = defaultdict(set)
-        self._lanes: dict[asyncio.Task[None], int] = {}
+        self._lanes: dict[asyncio.Task[None], Webhook] = {}
+        # The webhook that was given a lane last, and whether some could be given none, or not all that they want.
+        self._last = 0
+        self._is_short = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._main: asyncio.Task[None] | None = None
         self._thread: threading.Thread | None = None
@@ -315,23 +324,42 @@ class Deliverer:
             self._read_through[webhook.number] = through
 
     def _send(self, webhooks: dict[int, Webhook], due: Sequence[int]) -> None:
-        """Begin to send what is due, as far as there is room."""
-        for number in due:
-            webhook = webhooks.get(number)
-            lanes = list(self._lanes.values()).count(number)
+        """Begin to send what is due, as far as there is room: lane by lane to those who have the fewest.
+
+        Among equals it goes round. So others wait for slow receivers, however many these are, for a turn at most.
+        """
+        of_operator = Counter(webhook.operator for webhook in self._lanes.values())
+        of_webhook = Counter(webhook.number for webhook in self._lanes.values())
+
+        def wants(webhook: Webhook) -> bool:
+            return of_webhook[webhook.number] < (_LANES if webhook.failing_since_ms is None else _LANES_IF_FAILING)
+
+        def turn(webhook: Webhook) -> tuple[int, int, bool, int]:
+            fewest = of_operator[webhook.operator], of_webhook[webhook.number]
+            return *fewest, webhook.number <= self._last, webhook.number
+
+        waiting = [webhooks[number] for number in due if number in webhooks and wants(webhooks[number])]
+        while len(self._lanes) < _MOST_LANES:
+            webhook = min(
+                (one for one in waiting if of_operator[one.operator] < _LANES_OF_OPERATOR), key=turn, default=None
+            )
             if webhook is None:
-                continue
-            wanted = _LANES if webhook.failing_since_ms is None else _LANES_IF_FAILING
-            for _ in range(min(wanted - lanes, _MOST_LANES - len(self._lanes))):
-                lane = asyncio.create_task(self._serve(webhook))
-                self._lanes[lane] = number
-                lane.add_done_callback(self._lanes.pop)
+                break
+            lane = asyncio.create_task(self._serve(webhook))
+            self._lanes[lane] = webhook
+            lane.add_done_callback(self._lanes.pop)
+            of_operator[webhook.operator] += 1
+            of_webhook[webhook.number] += 1
+            self._last = webhook.number
+            waiting = [one for one in waiting if wants(one)]
+        self._is_short = bool(waiting)
 
     async def _serve(self, webhook: Webhook) -> None:
-        """Send what is due to a webhook, one event after another, until there is nothing more."""
+        """Send what is due to a webhook, one event after another, until there is nothing more or others wait."""
         sending = self._sending[webhook.number]
+        began = self._clock()
         try:
-            while self._is_ours():
+            while self._is_ours() and not (self._is_short and self._clock() - began >= _TURN_MS):
                 with self._ledger.webhooks() as rows:
                     due = rows.due(webhook.number, self._clock(), len(sending) + 1)
                 waiting = next((event for event in due if event.sequence not in sending), None)
@@ -361,30 +389,28 @@ class Deliverer:
             "AirMatrix-Delivery": delivery_id(webhook, entry),
             "AirMatrix-Signature": signature(webhook.secret, now // 1000, content),
         }
+        # Whether failing begins or ends with this; recording may take more than one try.
+        turns: list[bool] = []
         try:
             await self._post(webhook.url, content, headers)
         except DeliveryFailed as failure:
             error = str(failure)
         else:
-            await self._record(lambda rows, now: rows.delivered(waiting, now))
+            if await self._record(lambda rows, now: turns.append(rows.delivered(waiting, now))) and turns[-1]:
+                _tell(log.warning, "webhook deliveries work again", webhook=webhook.id)
             self._observe(DELIVERED)
             return
-        is_over = self._clock() - entry.time_ms >= _GIVE_UP_MS
-        _tell(
-            log.warning,
-            "webhook delivery given up" if is_over else "webhook delivery failed",
-            webhook=webhook.id,
-            flight_intent=entry.intent_id,
-            revision=entry.revision,
-            attempts=waiting.attempts + 1,
-            error=error,
-        )
-        if is_over:
+        about = {"webhook": webhook.id, "flight_intent": entry.intent_id, "revision": entry.revision, "error": error}
+        if self._clock() - entry.time_ms >= _GIVE_UP_MS:
+            _tell(log.warning, "webhook delivery given up", **about, attempts=waiting.attempts + 1)
             await self._record(lambda rows, now: rows.given_up(waiting, error, now))
-        else:
-            wait_ms = retry_after_ms(waiting.attempts + 1, self._chance())
-            await self._record(lambda rows, now: rows.failed(waiting, error, now + wait_ms, now))
-        self._observe(GIVEN_UP if is_over else FAILED)
+            self._observe(GIVEN_UP)
+            return
+        wait_ms = retry_after_ms(waiting.attempts + 1, self._chance())
+        record = self._record(lambda rows, now: turns.append(rows.failed(waiting, error, now + wait_ms, now)))
+        if await record and turns[-1]:
+            _tell(log.warning, "webhook deliveries fail", **about)
+        self._observe(FAILED)
 
 
 def _complain(error: Exception) -> None:

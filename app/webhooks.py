@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import httpx
 import orjson
+from anyio import to_thread
 from uuid_utils import uuid7
 
 from app.addresses import is_loopback
@@ -26,10 +27,13 @@ MOST_WEBHOOKS = 10
 _STATES = frozenset(state.value for state in State)
 _SECRET_BYTES = 32
 _FIRST_RETRY_MS, _LONGEST_RETRY_MS = 1_000, 600_000
-# IPv6: what is routed at all; what carries an IPv4 address through it, of which only the last is asked for by name.
+# IPv6: what is routed at all, and what carries an IPv4 address that is asked for by name.
 _GLOBAL_UNICAST = ipaddress.IPv6Network("2000::/3")
-_SIX_TO_FOUR = ipaddress.IPv6Network("2002::/16")
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
+# Nobody's servers, although some of it is routed (RFC 6890): protocols' own, relays of 6to4, and 6to4; documentation.
+_NO_HOSTS = [
+    ipaddress.ip_network(block) for block in ("192.0.0.0/24", "192.88.99.0/24", "2001::/23", "2002::/16", "3fff::/20")
+]
 
 
 @dataclass(frozen=True)
@@ -58,21 +62,23 @@ class Destinations:
         """
         try:
             url = httpx.URL(text)
-        except httpx.InvalidURL as error:
+            # Decoded only now; it may be no name (IDNA, RFC 5891).
+            host = url.host
+        except (httpx.InvalidURL, UnicodeError) as error:
             raise WebhookRefused(f"the url cannot be parsed: {error}") from None
         has_port = url.port is None or 0 < url.port < 65536
-        if not url.host or url.userinfo or url.fragment or not has_port:
+        if not host or url.userinfo or url.fragment or not has_port:
             raise WebhookRefused("the url must be that of a host, without user, password or fragment")
-        is_local = self.loopback and is_loopback(url.host)
+        is_local = self.loopback and is_loopback(host)
         if url.scheme != "https" and not (url.scheme == "http" and is_local):
             raise WebhookRefused(
                 "the url must begin with https://"
                 + (", or with http:// for this machine's loopback" if self.loopback else "")
             )
-        is_literal = _address(url.host) is not None
-        is_permitted = self.permits(url, url.host) if is_literal else is_local or self.private
-        if not is_permitted and (is_literal or is_loopback(url.host)):
-            raise WebhookRefused(f"{url.host} is not a public address")
+        is_literal = _address(host) is not None
+        is_permitted = self.permits(url, host) if is_literal else is_local or self.private
+        if not is_permitted and (is_literal or is_loopback(host)):
+            raise WebhookRefused(f"{host} is not a public address")
         return url
 
     def permits(self, url: httpx.URL, address: str) -> bool:
@@ -100,9 +106,9 @@ def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def _is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
-    if isinstance(address, ipaddress.IPv6Address) and (address not in _GLOBAL_UNICAST or address in _SIX_TO_FOUR):
+    if isinstance(address, ipaddress.IPv6Address) and address not in _GLOBAL_UNICAST:
         return False
-    return address.is_global
+    return address.is_global and not any(address in network for network in _NO_HOSTS)
 
 
 def kind_of(journal_kind: str) -> str:
@@ -186,21 +192,21 @@ class Webhooks:
         ------
         UnknownWebhook, QueueFull, LedgerUnavailable, OutcomeUnknown
         """
-        found: list[Webhook] = []
+        unknown = UnknownWebhook(f"there is no webhook {webhook_id}")
+        # What is nobody's, or somebody else's, is none of the writer's work.
+        known = await to_thread.run_sync(self._find, webhook_id)
+        if known is None or not may_change(known.operator):
+            raise unknown
 
         def run(transaction: Transaction, _: int) -> Webhook:
             with transaction.webhooks() as rows:
                 webhook = rows.find(webhook_id)
-                if webhook is None or not may_change(webhook.operator):
-                    raise UnknownWebhook(f"there is no webhook {webhook_id}")
-                found.append(webhook)
+                if webhook is None:
+                    raise unknown
                 rows.remove(webhook)
                 return webhook
 
-        def look_up() -> Webhook | None:
-            return found[-1] if found and self._find(webhook_id) is None else None
-
-        return await self._writer.perform(run, look_up)
+        return await self._writer.perform(run, lambda: known if self._find(webhook_id) is None else None)
 
     def _find(self, webhook_id: str) -> Webhook | None:
         with self._ledger.webhooks() as rows:

@@ -42,6 +42,8 @@ _FEWEST_LABELS = 1 << 14
 MAX_SURCHARGE_MS = 60_000
 # A refusal names the flights around as many labels at most: a flight that is shut in has few.
 _SHUT_IN_LABELS = 100
+# How often a flight that would be in the air for too long is looked for again with a later departure.
+_LATER_DEPARTURES = 16
 
 
 class Search(StrEnum):
@@ -90,12 +92,23 @@ class PlanRequest:
 
 
 class Planner:
-    """CFA* over one airspace and the reservations in `index`, or in another one. One thread at a time."""
+    """CFA* over one airspace and the reservations in `index`, or in another one. One thread at a time.
 
-    def __init__(self, airspace: Airspace, search: Search = Search.SAFE_INTERVAL, hover_limit_ms: int = 60_000) -> None:
+    `hover_limit_ms` bounds the greedy search's hovering in one place; `detour_limit_ms` how much longer than without
+    traffic a flight may be in the air, None for no bound.
+    """
+
+    def __init__(
+        self,
+        airspace: Airspace,
+        search: Search = Search.SAFE_INTERVAL,
+        hover_limit_ms: int = 60_000,
+        detour_limit_ms: int | None = None,
+    ) -> None:
         self.airspace = airspace
         self.search = search
         self.hover_limit_ms = hover_limit_ms
+        self.detour_limit_ms = detour_limit_ms
         self.index = OccupancyIndex(airspace.grid.block_count)
         self._open_links = open_links(airspace)
         self._offsets = build_offsets(airspace.grid)
@@ -105,10 +118,11 @@ class Planner:
         self._stamp = self._static_stamp = 0
         self._motions: dict[tuple[int, ...], Motion] = {}
 
-    def plan(self, request: PlanRequest, index: OccupancyIndex | None = None) -> Plan:
+    def plan(self, request: PlanRequest, index: OccupancyIndex | None = None, *, outlook: bool = True) -> Plan:
         """Return a conflict-free plan; with the safe-interval search the one of earliest arrival.
 
-        It is free of conflicts with what `index` holds: the planner's own by default.
+        It is free of conflicts with what `index` holds: the planner's own by default. Where there is none, an `outlook`
+        looks for a later departure that would work.
 
         Raises
         ------
@@ -129,7 +143,7 @@ class Planner:
         found = self._search(request, motion, bounds, index)
         if isinstance(found, Plan):
             return found
-        if not request.is_airborne:
+        if outlook and not request.is_airborne:
             found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request, motion, bounds, index)
         raise found
 
@@ -200,6 +214,34 @@ class Planner:
 
     def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex) -> Plan | NoPlan:
         """Search and return the plan, or the error that says why there is none."""
+        in_air, spent = self._longest_in_air(bounds), 0
+        asked = request
+        for _ in range(_LATER_DEPARTURES):
+            found = self._attempt(asked, motion, bounds, index)
+            if isinstance(found, NoPlan):
+                found.expansions += spent
+                return found
+            if found.flight_time_ms <= in_air:
+                if asked is request:
+                    return found
+                return replace(
+                    found, earliest_departure_ms=request.earliest_departure_ms, expansions=found.expansions + spent
+                )
+            spent += found.expansions
+            # Nobody arrives earlier than that; so who is in the air for no longer departs no earlier than this.
+            earliest = found.arrival_ms - in_air
+            if earliest > request.latest_departure_ms or self.search is Search.GREEDY:
+                break
+            asked = replace(request, earliest_departure_ms=earliest)
+        return NoConflictFreePath(
+            f"every conflict-free plan is in the air for more than {in_air / 1000:g} s: "
+            f"the time without traffic and {(self.detour_limit_ms or 0) / 1000:g} s",
+            expansions=spent,
+        )
+
+    def _attempt(self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex) -> Plan | NoPlan:
+        """Search once, for the earliest arrival within the aircraft's endurance; return as `_search` does."""
+        in_air = self._longest_in_air(bounds)
         task = Task(
             request.origin,
             request.destination,
@@ -208,6 +250,7 @@ class Planner:
             0 if request.is_airborne else self.airspace.terminal_dwell_ms,
             self.airspace.terminal_dwell_ms,
             self.hover_limit_ms,
+            min(request.latest_departure_ms + in_air - self.airspace.terminal_dwell_ms, FAR_FUTURE),
             stamp=0,
         )
         if self.search is Search.GREEDY:
@@ -227,8 +270,10 @@ class Planner:
         if status == search_kernels.NO_PATH:
             return NoConflictFreePath(
                 "no conflict-free path leads from the first block within the departure window",
-                # Who is shut out for good meets nobody on the way.
-                index.owners(task.destination, FAR_FUTURE - 1, FAR_FUTURE) or self._owners_around(index, label),
+                # Who has nowhere to land in time is not looked for on the way.
+                self._owners_around(index, label)
+                if further
+                else index.owners(task.destination, task.earliest, task.until),
                 expansions=expansions,
             )
         plan = self._plan(motion, index, task, bounds, label, expansions, visits)
@@ -257,10 +302,17 @@ class Planner:
             if isinstance(later, NoPlan):
                 break
             # Who departs as soon as the first block is free may have to hover, which an endurance may not allow.
-            endurance_matters = request.performance.endurance_ms is not None
+            is_long = later.arrival_ms - later.slot_opens_ms > self._longest_in_air(bounds)
+            endurance_matters = request.performance.endurance_ms is not None or is_long
             earliest = later.departure_ms if endurance_matters else later.slot_opens_ms
             latest = later.slot_opens_ms - 1
         return earliest
+
+    def _longest_in_air(self, bounds: Bounds) -> int:
+        """Return how long a flight may take, both dwells included, whatever its aircraft's endurance."""
+        if self.detour_limit_ms is None:
+            return FAR_FUTURE
+        return int(bounds.optimum) + 2 * self.airspace.terminal_dwell_ms + self.detour_limit_ms
 
     def _owners_around(self, index: OccupancyIndex, labels: int) -> tuple[int, ...]:
         """Return the owners of the reservations that shut in a search without a path, in the order it met them."""

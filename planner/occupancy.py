@@ -98,8 +98,8 @@ class OccupancyIndex:
                     del self._closures[number]
                 self._index_closures()
 
-    def without(self, owners: IntArray) -> "OccupancyIndex":
-        """Return a copy without the reservations of some owners; closures reach where those were."""
+    def copy(self) -> "OccupancyIndex":
+        """Return an index with the same reservations and closures."""
         copied = OccupancyIndex(0)
         used = int(self.slabs.chains[-1])
         copied.slabs = intervals.Slabs(
@@ -107,15 +107,19 @@ class OccupancyIndex:
             np.concatenate([self.slabs.pool[:used], np.empty((max(used, 1 << 12), 3), dtype=np.int64)]),
             self.slabs.chains.copy(),
         )
+        copied._size = self._size
         copied._closures = dict(self._closures)
         copied._closed_rows, copied._is_closed = self._closed_rows, self._is_closed
-        copied._size = self._size - int(intervals.drop_owners(*copied.slabs, np.unique(owners)))
-        copied._lay_closures(np.flatnonzero(self._is_closed))
         return copied
 
-    def copy(self) -> "OccupancyIndex":
-        """Return an index with the same reservations and closures."""
-        return self.without(np.empty(0, dtype=np.int64))
+    def without(self, owners: IntArray) -> "OccupancyIndex":
+        """Return a copy without the reservations of one or more owners; closures reach where those were."""
+        copied, first_owner = self.copy(), int(owners.min())
+        is_dropped = np.zeros(int(owners.max()) - first_owner + 1, dtype=np.bool_)
+        is_dropped[owners - first_owner] = True
+        copied._size -= int(intervals.drop_owners(*copied.slabs, is_dropped, first_owner))
+        copied._lay_closures(np.flatnonzero(self._is_closed))
+        return copied
 
     def forget_before(self, time_ms: int) -> int:
         """Drop the reservations and closures that end by `time_ms`; return how many reservations."""

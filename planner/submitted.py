@@ -178,6 +178,11 @@ def volumes_path(
         if end not in volumes[0]:
             raise NotFlyable(f"no volume is of the {name}'s block, {list(airspace.grid.block(end))}")
     block, arrive_ms, depart_ms = _way_through(airspace, performance, origin, destination, volumes)
+    in_air_ms, endurance_ms = int(depart_ms[-1] - arrive_ms[0]), performance.endurance_ms
+    if endurance_ms is not None and in_air_ms > endurance_ms:
+        raise BeyondEndurance(
+            f"the volumes last {in_air_ms / 1000:g} s, and the aircraft's endurance is {endurance_ms / 1000:g} s"
+        )
     early, late = enter_ms < arrive_ms[0], exit_ms > depart_ms[-1] + 1
     _refuse_first(
         [

@@ -96,6 +96,10 @@ class Schedule:
         return Figures.of(self.delay_ms, alone_ms)
 
 
+class Interrupted(Exception):
+    """Told to stop before there was a first schedule."""
+
+
 class _InOrder(NamedTuple):
     """Plans of flights that were planned one after another, and the index with them."""
 
@@ -106,7 +110,8 @@ class _InOrder(NamedTuple):
 class Together:
     """Plans requests of equal standing around what is reserved: in the planner's index, or in another one.
 
-    `first_come` is the base line, in the order of the requests; `improve` makes `best` better. In `best`
+    `first_come` is the base line, in the order of the requests; `should_stop` is asked before each of them. `improve`
+    makes `best` better. In `best`
 
     - everybody has a plan whom first come, first served gives one;
     - unless more flights have one, delays are not longer in all, and none is longer than the longest was.
@@ -118,10 +123,17 @@ class Together:
     ------
     NotPlannable
         No traffic could make a request possible.
+    Interrupted
+        There is no base line yet, and it `should_stop`.
     """
 
     def __init__(
-        self, planner: Planner, requests: Sequence[PlanRequest], reserved: OccupancyIndex | None = None, seed: int = 0
+        self,
+        planner: Planner,
+        requests: Sequence[PlanRequest],
+        reserved: OccupancyIndex | None = None,
+        seed: int = 0,
+        should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self._planner = planner
         self._requests = requests
@@ -132,8 +144,9 @@ class Together:
             dtype=np.int64,
         )
         self._order = np.arange(len(requests))
-        found = self._in_order(self._order, lambda: False)
-        assert found is not None
+        found = self._in_order(self._order, should_stop)
+        if found is None:
+            raise Interrupted(f"told to stop before all of {len(requests)} flights were planned once")
         self._plans, self._index = found
         self.first_come = Schedule(tuple(self._plans))
         # Delays of the best schedule, of the order tried last, and without the others of the batch.
@@ -159,7 +172,7 @@ class Together:
         """
         while not (self.is_best_possible or self.iterations == most_iterations or should_stop()):
             if self._alone is None:
-                self._alone = Schedule(tuple(self._plan(request, self._reserved) for request in self._requests))
+                self._alone = self._each_alone(should_stop)
             elif self.iterations < _ORDERS:
                 self.iterations += self._try_order(should_stop)
             else:
@@ -168,9 +181,18 @@ class Together:
 
     def _plan(self, request: PlanRequest, index: OccupancyIndex) -> Plan | None:
         try:
-            return self._planner.plan(request, index)
+            return self._planner.plan(request, index, outlook=False)
         except NoPlan:
             return None
+
+    def _each_alone(self, should_stop: Callable[[], bool]) -> Schedule | None:
+        """Plan each flight as if there were no other of the batch; return None if told to stop."""
+        plans: list[Plan | None] = []
+        for request in self._requests:
+            if should_stop():
+                return None
+            plans.append(self._plan(request, self._reserved))
+        return Schedule(tuple(plans))
 
     def _in_order(self, order: IntArray, should_stop: Callable[[], bool]) -> "_InOrder | None":
         """Plan all flights one after another; return the plans, and the index with them, or None if told to stop."""

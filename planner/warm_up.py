@@ -31,7 +31,7 @@ def warm_up() -> None:
         planner.index.reserve(block, enter, leave, owner=1)
         planner.index.release(block, enter, leave)
         planner.index.close({1: Closure(block, enter, leave)})
-        planner.index.copy().owners(4, 0, 1)
+        planner.index.without(block).owners(4, 0, 1)
         planner.index.forget_before(0)
         request = PlanRequest(0, grid.block_count - 1, performance, 0, 0, surcharge)
         with suppress(EnduranceExceeded):

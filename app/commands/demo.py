@@ -68,11 +68,12 @@ def demo(
             service = stack.enter_context(_serving(folder, port, rate))
             client = stack.enter_context(Client(service.url))
             demand = RandomIntents.served_by(client, Od.LOWEST)
-            _introduce(service.url, demand.title, flights, rate, deviations)
             clock = ServiceTime(client)
             grid = grid_of(client.airspace())
             pilots = Pilots(client, clock, grid, Dispatch(client, clock, grid, wish, None), 1.0)
             report = pilots.report
+            # From here on the loss of the service is told as what it is.
+            _introduce(service.url, demand.title, flights, rate, deviations)
             traffic = stack.enter_context(at_work(Traffic(client, clock, demand, flights, seed)))
             end_s = math.inf if duration is None else time.monotonic() + duration
 

@@ -41,7 +41,8 @@ def fly(
 ) -> None:
     """Fly the accepted flights of a service: activate each, and report where its aircraft is, until Ctrl-C.
 
-    Flights that are accepted meanwhile fly too. The service's clock says what time it is, also where it runs fast.
+    Flights that are accepted meanwhile fly too; those that are planned again fly as they are planned then.
+    The service's clock says what time it is, also where it runs fast.
 
     Of the flights that deviate, each does so in one way: `late` departs late; `drift` goes sideways and returns;
     `layer` flies a layer too high or too low; `hover` stops in mid-air; `lost` falls silent; with `intruder`, somebody

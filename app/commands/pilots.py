@@ -25,6 +25,7 @@ from app.commands.deviations import Deviations, Flown
 from app.commands.flight_model import Way, places, planned_way
 from app.flight_intents import OPEN_STATES, State
 from app.routes.answers import FlightIntentAnswer
+from app.routes.events import Event
 from app.times import format_time
 from planner.airmatrix import AirMatrix
 
@@ -142,13 +143,12 @@ class Dispatch:
         self._grid = grid
         self._deviations = deviations
         self._operator = operator
-        self._known: set[str] = set()
-        self._cancelled: set[str] = set()
+        self._numbers: dict[str, int] = {}
         self._due: list[tuple[int, int, Callable[[str], object], str]] = []
         self._order = count()
         self._over = threading.Event()
-        self.found: SimpleQueue[Aircraft] = SimpleQueue()
-        self.cancelled: SimpleQueue[str] = SimpleQueue()
+        # Aircraft that are to fly, in place of what had that id before; None: the flight does not take place.
+        self.found: SimpleQueue[tuple[str, Aircraft | None]] = SimpleQueue()
         self.refused: Counter[str] = Counter()
         # Before the list, so that nothing falls between the two.
         self._revision = client.readiness().revision
@@ -185,19 +185,29 @@ class Dispatch:
         self._over.set()
 
     def _follow(self) -> None:
-        """Take up the flights that were accepted since, and let go of those that were cancelled."""
+        """Take up the flights that were accepted or planned again since, and let go of those that have no place now."""
         while not self._over.is_set():
             page = self._client.events(self._revision)
             for event in page.items:
-                id_ = event.flight_intent_id
-                if event.kind == State.ACCEPTED and id_ is not None and id_ not in self._known:
-                    self._read(id_)
-                elif event.kind == State.CANCELLED and id_ is not None:
-                    self._cancelled.add(id_)
-                    self.cancelled.put(id_)
-                self._revision = event.revision
+                # Who fails among the events of one revision reads all of them again.
+                self._revision = event.revision - 1
+                self._heed(event)
+            if page.items:
+                self._revision = page.items[-1].revision
             if page.next_cursor is None:
                 return
+
+    def _heed(self, event: Event) -> None:
+        id_ = event.flight_intent_id
+        if id_ is None:
+            return
+        if event.kind in (State.CANCELLED, State.DISPLACED):
+            self._forget_what_is_due(id_)
+            self.found.put((id_, None))
+        elif (event.kind == State.ACCEPTED and id_ not in self._numbers) or event.details:
+            # Only what was planned again has details.
+            self._forget_what_is_due(id_)
+            self._read(id_)
 
     def _read(self, id_: str) -> None:
         try:
@@ -212,23 +222,30 @@ class Dispatch:
             self._take(intent)
 
     def _take(self, intent: FlightIntentAnswer) -> None:
-        if intent.state not in OPEN_STATES or intent.id in self._known or not intent.trajectory:
+        if intent.state not in OPEN_STATES or not intent.trajectory:
             return
         blocks, arrive_ms, depart_ms = zip(
             *((self._grid.index(point.block), point.arrive, point.depart) for point in intent.trajectory), strict=True
         )
         plan = planned_way(self._grid.centres(np.array(blocks)), np.array(arrive_ms), np.array(depart_ms))
-        flown = self._deviations.of(plan, intent.sequence, len(self._known), self._grid)
-        self._known.add(intent.id)
+        number = self._numbers.setdefault(intent.id, len(self._numbers))
+        flown = self._deviations.of(plan, intent.sequence, number, self._grid)
         # Who departs late stands on its pad for longer.
-        self.found.put(Aircraft(intent.id, flown, plan.begin_ms - _BEFORE_MS))
+        self._put(Aircraft(intent.id, flown, plan.begin_ms - _BEFORE_MS))
         if flown.intruder is not None:
             crossing = Flown(flown.intruder)
-            self.found.put(Aircraft(f"intruder-{intent.sequence}", crossing, crossing.way.begin_ms, is_track=True))
+            self._put(Aircraft(f"intruder-{intent.sequence}", crossing, crossing.way.begin_ms, is_track=True))
         if intent.state == State.ACCEPTED:
             self._plan(flown.way.begin_ms - _BEFORE_MS, self._client.activate, intent.id)
         if flown.is_lost_for_good:
             self._plan(flown.way.end_ms, self._client.end, intent.id)
+
+    def _put(self, aircraft: Aircraft) -> None:
+        self.found.put((aircraft.id, aircraft))
+
+    def _forget_what_is_due(self, id_: str) -> None:
+        self._due = [entry for entry in self._due if entry[3] != id_]
+        heapq.heapify(self._due)
 
     def _plan(self, time_ms: int, what: Callable[[str], object], id_: str) -> None:
         heapq.heappush(self._due, (time_ms, next(self._order), what, id_))
@@ -236,14 +253,13 @@ class Dispatch:
     def _do_what_is_due(self) -> None:
         while self._due and self._due[0][0] <= self._clock.now() and not self._over.is_set():
             _, _, what, id_ = self._due[0]
-            if id_ not in self._cancelled:
-                try:
-                    what(id_)
-                except ProblemAnswer as problem:
-                    # What is only busy is asked again.
-                    if problem.status == HTTPStatus.SERVICE_UNAVAILABLE:
-                        raise
-                    self.refused[f"activate or end: {problem.reason}"] += 1
+            try:
+                what(id_)
+            except ProblemAnswer as problem:
+                # What is only busy is asked again.
+                if problem.status == HTTPStatus.SERVICE_UNAVAILABLE:
+                    raise
+                self.refused[f"activate or end: {problem.reason}"] += 1
             heapq.heappop(self._due)
 
 
@@ -258,7 +274,8 @@ class Pilots:
         self._grid = grid
         self._dispatch = dispatch
         self._interval_ms = max(int(interval_s * 1000), 1)
-        self._waiting: list[tuple[int, int, Aircraft]] = []
+        self._queue: list[tuple[int, int, Aircraft]] = []
+        self._waiting: dict[str, Aircraft] = {}
         self._order = count()
         self._flying: dict[str, Aircraft] = {}
         self._last_ms = clock.now()
@@ -298,21 +315,29 @@ class Pilots:
         return max(self._last_ms // self._interval_ms + 1, now // self._interval_ms) * self._interval_ms
 
     def _take_up(self) -> None:
-        for aircraft in _taken(self._dispatch.found):
-            heapq.heappush(self._waiting, (aircraft.from_ms, next(self._order), aircraft))
-        for id_ in _taken(self._dispatch.cancelled):
-            self._waiting = [entry for entry in self._waiting if entry[2].id != id_]
-            heapq.heapify(self._waiting)
+        for id_, aircraft in _taken(self._dispatch.found):
             flying = self._flying.get(id_)
-            if flying is not None and self._last_ms < flying.way.begin_ms:
-                del self._flying[id_]
+            if aircraft is None:
+                self._waiting.pop(id_, None)
+                if flying is not None and self._last_ms < flying.way.begin_ms:
+                    del self._flying[id_]
+            elif flying is not None:
+                # In the air too: a new plan begins with what was flown of the old one.
+                self._flying[id_] = aircraft
+            else:
+                self._waiting[id_] = aircraft
+                heapq.heappush(self._queue, (aircraft.from_ms, next(self._order), aircraft))
 
     def _tick(self, time_ms: int) -> None:
         """Report where everybody is."""
         self.report.skipped += (time_ms - self._last_ms - 1) // self._interval_ms
         self._last_ms = time_ms
-        while self._waiting and self._waiting[0][0] <= time_ms:
-            aircraft = heapq.heappop(self._waiting)[2]
+        while self._queue and self._queue[0][0] <= time_ms:
+            aircraft = heapq.heappop(self._queue)[2]
+            # Meanwhile it may have been planned again, or withdrawn.
+            if self._waiting.get(aircraft.id) is not aircraft:
+                continue
+            del self._waiting[aircraft.id]
             self._flying[aircraft.id] = aircraft
             if aircraft.flown.kind is not None:
                 self.report.deviating[aircraft.flown.kind.value] += 1

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.serialization import (
     PrivateFormat,
     load_pem_private_key,
 )
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from app.auth import HIGHEST_PRIORITY, PRIORITY_CLAIM, SCOPES
 from app.commands.terminal import remark, write
@@ -60,7 +60,13 @@ def print_token(
     unknown = [name for name in scope if name not in SCOPES]
     if unknown:
         raise typer.BadParameter(f"{unknown[0]!r} is none of {', '.join(sorted(SCOPES))}", param_hint="--scope")
-    TypeAdapter(Label).validate_python(operator)
+    try:
+        TypeAdapter(Label).validate_python(operator)
+    except ValidationError as error:
+        raise typer.BadParameter(
+            "an operator's name has 1 to 200 characters, not only blanks, and no control characters",
+            param_hint="--operator",
+        ) from error
     settings = Settings()
     now = time.time()
     claims: dict[str, Any] = {

@@ -22,7 +22,7 @@ from app.flight_intents import OPEN_STATES, FlightIntent, HeldReservations, Refu
 from app.ledger import constraints as closed
 from app.ledger import positions, queries
 from app.ledger.queries import IdempotencyRecord, JournalEntry
-from app.ledger.rows import columns_of, dump_columns, joined, to_held, to_row
+from app.ledger.rows import columns_of, dump_columns, joined, joined_held, to_held, to_row
 from app.ledger.tables import counters, flight_intents, idempotency_keys, journal, reservations
 from app.ledger.webhooks import WebhookRows
 from app.surveillance import Aircraft, Remark, Sighting
@@ -143,7 +143,7 @@ class Transaction:
             counters,
             sequence=counters.sequence + 1,
             longest_flight=max(counters.longest_flight, 0 if trajectory is None else trajectory.flight_time_ms),
-            lowest_priority=min(counters.lowest_priority, submission.priority),
+            lowest_priority=min(counters.lowest_priority, 0 if trajectory is None else submission.priority),
         )
         revision = self._append(self._counters.sequence, intent_id, now_ms, state, released=None)
         intent = FlightIntent(
@@ -187,8 +187,9 @@ class Transaction:
     def vacate(self, intents: Sequence[FlightIntent]) -> None:
         """Take away all reservations of flights that are about to be rewritten."""
         self.flush()
-        mine = reservations.c.intent.in_([intent.sequence for intent in intents])
-        self._connection.execute(delete(reservations).where(mine))
+        for start in range(0, len(intents), queries.BOUND_AT_ONCE):
+            part = [intent.sequence for intent in intents[start : start + queries.BOUND_AT_ONCE]]
+            self._connection.execute(delete(reservations).where(reservations.c.intent.in_(part)))
 
     @_asking()
     def rewrite(
@@ -371,13 +372,15 @@ class Transaction:
     def held_after(self, time_ms: int, sequences: Sequence[int] | None = None) -> HeldReservations:
         """Return the reservations that end after a time, of all intents or of some, by intent."""
         self.flush()
-        query = select(reservations).where(reservations.c.exit > time_ms)
-        if sequences is not None:
-            query = query.where(reservations.c.intent.in_(sequences))
-        else:
+        query = select(reservations).where(reservations.c.exit > time_ms).order_by(reservations.c.intent)
+        if sequences is None:
             # Found by their flights: the ledger may hold years of reservations.
-            query = query.where(queries.in_the_air(time_ms, None))
-        return to_held(self._connection.execute(query.order_by(reservations.c.intent)))
+            return to_held(self._connection.execute(query.where(queries.in_the_air(time_ms, None))))
+        parts = (
+            reservations.c.intent.in_(sequences[start : start + queries.BOUND_AT_ONCE])
+            for start in range(0, len(sequences), queries.BOUND_AT_ONCE)
+        )
+        return joined_held([to_held(self._connection.execute(query.where(part))) for part in parts])
 
     @_asking()
     def answer_to(self, operator: str, key: str, since_ms: int) -> IdempotencyRecord | None:

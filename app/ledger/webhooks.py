@@ -281,21 +281,28 @@ class WebhookRows:
         reference = select(flight_intents.c.reference).where(flight_intents.c.sequence == waiting.sequence)
         return entry, self._connection.execute(reference).scalar_one_or_none()
 
-    def delivered(self, waiting: Waiting, now_ms: int) -> None:
-        """Take down that an event was delivered: the next of its flight intent is due."""
+    def delivered(self, waiting: Waiting, now_ms: int) -> bool:
+        """Take down that an event was delivered: the next of its flight intent is due.
+
+        Tells whether the webhook was failing and is not any more.
+        """
         self._finish(waiting, now_ms)
         own = webhooks.c.number == waiting.webhook
         self._connection.execute(update(webhooks).where(own).values(last_delivery=now_ms))
         is_over = and_(webhooks.c.failing_since.is_not(None), ~_is_failing(waiting.webhook))
-        self._connection.execute(update(webhooks).where(own, is_over).values(failing_since=None))
+        return bool(self._connection.execute(update(webhooks).where(own, is_over).values(failing_since=None)).rowcount)
 
-    def failed(self, waiting: Waiting, error: str, next_try_ms: int, now_ms: int) -> None:
-        """Take down that an event could not be delivered, and when that is to be tried again."""
+    def failed(self, waiting: Waiting, error: str, next_try_ms: int, now_ms: int) -> bool:
+        """Take down that an event could not be delivered, and when that is to be tried again.
+
+        Tells whether the webhook was not failing before.
+        """
         tried = update(webhook_events).where(_is(waiting))
         self._connection.execute(tried.values(attempts=waiting.attempts + 1, next_try=next_try_ms, last_error=error))
-        own = update(webhooks).where(webhooks.c.number == waiting.webhook)
-        since = func.coalesce(webhooks.c.failing_since, now_ms)
-        self._connection.execute(own.values(last_error=error, failing_since=since))
+        own = webhooks.c.number == waiting.webhook
+        self._connection.execute(update(webhooks).where(own).values(last_error=error))
+        begins = update(webhooks).where(own, webhooks.c.failing_since.is_(None))
+        return bool(self._connection.execute(begins.values(failing_since=now_ms)).rowcount)
 
     def given_up(self, waiting: Waiting, error: str, now_ms: int) -> None:
         """Take down that an event will not be delivered: the next of its flight intent is due."""

@@ -262,11 +262,13 @@ def more_of(grid: AirMatrix, submission: Submission, refusal: Refusal) -> dict[s
 
 def outcome_body(service: Service, outcome: Outcome) -> bytes:
     """Return the body of the answer to a submission or a change."""
-    refusal = outcome.intent.refusal
-    if refusal is not None:
-        more = more_of(service.airspace.grid, outcome.intent.submission, refusal)
-        return problems.refusal_body(refusal, outcome.intent, more=more)
-    answer = render(service.airspace.grid, outcome.intent)
+    intent = outcome.intent
+    # A displaced flight has a refusal too, but was accepted.
+    if intent.state is State.REJECTED:
+        assert intent.refusal is not None
+        more = more_of(service.airspace.grid, intent.submission, intent.refusal)
+        return problems.refusal_body(intent.refusal, intent, more=more)
+    answer = render(service.airspace.grid, intent)
     return orjson.dumps({**answer, "displaced": displacements(outcome.displaced)})
 
 
@@ -284,7 +286,7 @@ def outcome_response(service: Service, outcome: Outcome) -> Response:
     headers = {"Server-Timing": ", ".join(f"{name};dur={seconds * 1000:.3f}" for name, seconds in spans.items())}
     if outcome.replayed is not None:
         headers["Idempotent-Replayed"] = "true"
-    if intent.refusal is not None:
+    if intent.state is State.REJECTED:
         return Response(content, problems.KINDS[NoPlan].status, headers, problems.MEDIA_TYPE)
     version = intent.version if outcome.replayed is None else orjson.loads(outcome.replayed)["version"]
     headers |= {"Location": f"{PATH}/{intent.id}", "ETag": f'"{version}"'}

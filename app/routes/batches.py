@@ -1,22 +1,24 @@
 """Batches: flight intents of equal standing, planned together."""
 
+import asyncio
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
 import orjson
 from anyio import to_thread
-from fastapi import APIRouter, Header, Response
+from fastapi import APIRouter, Header, Request, Response
+from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from app import problems
 from app.auth import CallerDep
 from app.batches import BatchKey, BatchOutcome
 from app.deconfliction import Outcome
-from app.errors import ItemRefused, UnknownAircraftType
+from app.errors import ItemRefused, MalformedRequest, OperatorMismatch, PriorityNotAllowed, UnknownAircraftType
 from app.routes.answers import ChangedFlightIntentAnswer, outcome_body
-from app.routes.submissions import Finite, FlightIntentBody, located, spoken_for
+from app.routes.submissions import Finite, FlightIntentBody, PositionBody, located, spoken_for
 from app.service import Service, ServiceDep
 from planner.errors import NotPlannable
 from planner.together import Figures
@@ -64,6 +66,18 @@ class BatchBody(BaseModel):
         Finite, Field(ge=0, le=_LONGEST_S, description="How long to look for something better than their order.")
     ] = 1.0
 
+    @model_validator(mode="before")
+    @classmethod
+    def _soon_refused(cls, body: object) -> object:
+        """Look at no more of a body than it takes to see that it is none."""
+        body = problems.with_one_unknown(body, cls)
+        items = body.get("flight_intents") if isinstance(body, dict) else None
+        if not isinstance(body, dict) or not isinstance(items, list):
+            return body
+        if len(items) > _MOST_INTENTS:
+            raise ValueError(f"{len(items)} flight_intents; a batch may have up to {_MOST_INTENTS}")
+        return {**body, "flight_intents": [_with_few_unknown(item) for item in items]}
+
     @model_validator(mode="after")
     def _of_equal_standing(self) -> "BatchBody":
         first = self.flight_intents[0].priority
@@ -74,6 +88,14 @@ class BatchBody(BaseModel):
                     "a batch has one"
                 )
         return self
+
+
+def _with_few_unknown(item: object) -> object:
+    item = problems.with_one_unknown(item, FlightIntentBody)
+    if not isinstance(item, dict):
+        return item
+    places = {name: item[name] for name in ("origin", "destination") if name in item}
+    return item | {name: problems.with_one_unknown(place, PositionBody) for name, place in places.items()}
 
 
 class FiguresBody(BaseModel):
@@ -121,10 +143,11 @@ class BatchAnswer(BaseModel):
     "",
     status_code=201,
     response_class=Response,
-    responses={201: {"model": BatchAnswer}, **problems.documented(400, 413, 422, 503)},
+    responses={201: {"model": BatchAnswer}, **problems.documented(400, 403, 413, 422, 429, 503)},
     summary="Submit flight intents together",
 )
 async def submit(
+    request: Request,
     service: ServiceDep,
     caller: CallerDep,
     body: BatchBody,
@@ -135,25 +158,51 @@ async def submit(
     First come, first served in the order of the batch is what they would get one by one. Other orders are tried from
     there, for `improve_for_s`, so that delays become fewer and less unequal: whoever would have a plan one by one has
     one, and unless more of them have one, they are not delayed more in all. A single flight may well be. Nobody else's
-    flight is moved, whatever the priority. Some batches may wait for each other; more are answered 503.
+    flight is moved, whatever the priority. Some batches may wait for each other; more are answered
+    503, a second one of the same operator 429. One that cannot be planned in time is answered 503 too: send fewer
+    flight intents then.
 
     The answer to a repetition with the same `Idempotency-Key` has the flight intents as they are by then.
     """
-    bodies = [spoken_for(caller, item) for item in body.flight_intents]
-    submissions = []
-    for number, item in enumerate(bodies):
+    # One has been counted already.
+    service.access.overdraw(caller, len(body.flight_intents) - 1)
+    bodies, submissions = [], []
+    for number, item in enumerate(body.flight_intents):
         with _item(number):
-            submissions.append(located(service, item))
+            bodies.append(spoken_for(caller, item))
+            submissions.append(located(service, bodies[number]))
     key = None
     if idempotency_key is not None:
         asked = {"flight_intents": [item.model_dump() for item in bodies], "improve_for_s": body.improve_for_s}
         digest = hashlib.sha256(orjson.dumps(asked, option=orjson.OPT_SORT_KEYS)).hexdigest()
         key = BatchKey(idempotency_key, digest)
-    outcome = await service.batches.submit(submissions, body.improve_for_s, key, service.closing.is_set)
+    planning = service.batches.submit(submissions, body.improve_for_s, key, service.closing.is_set)
+    outcome = await _while_connected(request, planning)
     # Hundreds of trajectories take a while to write down.
     content = await to_thread.run_sync(_answer, service, outcome)
     headers = {"Idempotent-Replayed": "true"} if outcome.is_replayed else None
     return Response(content, 201, headers, "application/json")
+
+
+async def _while_connected(request: Request, work: Coroutine[Any, Any, BatchOutcome]) -> BatchOutcome:
+    """Return what comes of some work, which is cancelled if the client hangs up; raises `MalformedRequest` then."""
+    job, hung_up = asyncio.ensure_future(work), asyncio.ensure_future(_hung_up(request))
+    try:
+        await asyncio.wait((job, hung_up), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        hung_up.cancel()
+        job.cancel()
+    try:
+        return await job
+    except asyncio.CancelledError:
+        if not job.cancelled():
+            raise
+        raise MalformedRequest("the connection ended before the batch was planned") from None
+
+
+async def _hung_up(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
 
 
 @contextmanager
@@ -161,8 +210,12 @@ def _item(number: int) -> Iterator[None]:
     """Say of which item it is that something is wrong."""
     try:
         yield
-    except (UnknownAircraftType, NotPlannable) as error:
+    except (UnknownAircraftType, NotPlannable, OperatorMismatch, PriorityNotAllowed) as error:
         raise ItemRefused(number, error) from error
+    except RequestValidationError as error:
+        place = ("body", "flight_intents", number)
+        found = [{**item, "loc": (*place, *item["loc"][1:])} for item in error.errors()]
+        raise RequestValidationError(found) from error
 
 
 def _answer(service: Service, outcome: BatchOutcome) -> bytes:

@@ -1,7 +1,6 @@
 """Constraints: airspace that is closed for a while, or for good."""
 
 from typing import Annotated, Any, Literal
-from uuid import UUID
 
 import orjson
 from anyio import to_thread
@@ -14,7 +13,7 @@ from app import problems
 from app.constraints import Constraint
 from app.errors import UnknownConstraint
 from app.labels import Label
-from app.routes import paging
+from app.routes import ids, paging
 from app.routes.airspace import FEATURES, GEOJSON, geojson
 from app.routes.answers import DisplacementBody, displacements
 from app.routes.submissions import Finite
@@ -205,7 +204,7 @@ def read(service: ServiceDep, constraint_id: str) -> Response:
     """Return a constraint, also one that has ended or was removed."""
     constraint = service.ledger.constraint(_id(constraint_id))
     if constraint is None:
-        raise _unknown(constraint_id)
+        raise UnknownConstraint(f"there is no constraint {constraint_id}")
     return Response(orjson.dumps(render(constraint)), media_type="application/json")
 
 
@@ -239,16 +238,7 @@ def render(constraint: Constraint) -> dict[str, Any]:
 
 
 def _id(text: str) -> str:
-    """Return the id in a path; what is no UUID is the id of nothing, and no database's business."""
-    try:
-        UUID(text)
-    except ValueError:
-        raise _unknown(text) from None
-    return text
-
-
-def _unknown(constraint_id: str) -> UnknownConstraint:
-    return UnknownConstraint(f"there is no constraint {constraint_id}")
+    return ids.existing(text, UnknownConstraint, "constraint")
 
 
 def _invalid(member: str, message: str) -> RequestValidationError:

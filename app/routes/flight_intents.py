@@ -3,7 +3,6 @@
 import hashlib
 import re
 from typing import Annotated
-from uuid import UUID
 
 import orjson
 from anyio import to_thread
@@ -19,7 +18,7 @@ from app.errors import (
 )
 from app.flight_intents import Refusal, State
 from app.labels import Label
-from app.routes import paging
+from app.routes import ids, paging
 from app.routes.answers import (
     PATH,
     ChangedFlightIntentAnswer,
@@ -221,12 +220,7 @@ def _versions(if_match: str | None) -> frozenset[int] | None:
 
 
 def _id(text: str) -> str:
-    """Return the id in a path; what is no UUID is the id of nothing, and no database's business."""
-    try:
-        UUID(text)
-    except ValueError:
-        raise UnknownFlightIntent(f"there is no flight intent {text}") from None
-    return text
+    return ids.existing(text, UnknownFlightIntent, "flight intent")
 
 
 async def _own(service: Service, caller: Caller, text: str) -> str:

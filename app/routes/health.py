@@ -97,7 +97,8 @@ def _troubles_of(writer: Writer) -> list[str]:
     if not writer.is_running:
         troubles.append("the ledger writer has stopped")
     if writer.trouble is not None:
-        troubles.append(f"the last write failed: {writer.trouble}")
+        # Why, with what belongs to the ledger's place, is in the log.
+        troubles.append("the last write failed")
     if writer.is_full:
         troubles.append(f"the queue is full: {writer.waiting} requests are waiting")
     if writer.waiting_s > _LONGEST_WAIT_S:

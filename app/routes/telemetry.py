@@ -167,18 +167,19 @@ async def report(service: ServiceDep, caller: CallerDep, request: Request) -> Te
 def _read(body: bytes) -> tuple[list[tuple[int, Report]], dict[int, PositionRefused]]:
     """Return the positions that can be read, with their indices, and what is wrong with the others."""
     try:
-        items = _Envelope.model_validate(from_json(body)).positions
+        items = _Envelope.model_validate(problems.with_one_unknown(from_json(body), _Envelope)).positions
     except ValidationError as error:
         raise RequestValidationError([{**item, "loc": ("body", *item["loc"])} for item in error.errors()]) from error
     except ValueError as error:
         raise MalformedRequest(f"the body is not valid JSON: {error}") from error
     if len(items) > MAX_POSITIONS:
         raise TooManyPositions(f"{len(items)} positions; a report may have up to {MAX_POSITIONS}")
+    items = [problems.with_one_unknown(item, PositionReport) for item in items]
     refused: dict[int, PositionRefused] = {}
     try:
         read = _POSITIONS.validate_python(items)
     except ValidationError as error:
-        for item in error.errors():
+        for item in error.errors(include_url=False, include_context=False, include_input=False):
             refused.setdefault(int(item["loc"][0]), _refusal(item))
         read = _POSITIONS.validate_python([item for index, item in enumerate(items) if index not in refused])
     indices = [index for index in range(len(items)) if index not in refused]

@@ -8,10 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app import problems
 from app.auth import Caller, CallerDep
-from app.errors import OperatorMismatch
+from app.errors import OperatorMismatch, UnknownWebhook
 from app.labels import Label
 from app.ledger.webhooks import Webhook
-from app.routes import paging
+from app.routes import ids, paging
 from app.service import ServiceDep
 from app.times import Moment
 
@@ -126,7 +126,8 @@ def list_webhooks(
 @router.delete("/{webhook_id}", responses=problems.documented(404, 503), summary="Unsubscribe")
 async def unsubscribe(service: ServiceDep, caller: CallerDep, webhook_id: str) -> WebhookAnswer:
     """Remove a webhook, and return it; what waits for it is not sent any more."""
-    return WebhookAnswer(**_members(await service.webhooks.unsubscribe(webhook_id, caller.may_change), 0))
+    own_id = ids.existing(webhook_id, UnknownWebhook, "webhook")
+    return WebhookAnswer(**_members(await service.webhooks.unsubscribe(own_id, caller.may_change), 0))
 
 
 def _operator(caller: Caller, body: WebhookBody) -> str:

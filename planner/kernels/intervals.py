@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from planner.airmatrix import Int32Array, IntArray
+from planner.airspace import BoolArray
 from planner.kernels.policy import allocating_kernel, kernel
 
 FAR_FUTURE = 1 << 62
@@ -216,22 +217,18 @@ def forget(table: Int32Array, pool: IntArray, chains: IntArray, time: int) -> in
 
 
 @kernel
-def drop_owners(table: Int32Array, pool: IntArray, chains: IntArray, owners: IntArray) -> int:
-    """Drop every reservation of owners (sorted), and every part of a closure; return how many were reservations."""
+def drop_owners(table: Int32Array, pool: IntArray, chains: IntArray, is_dropped: BoolArray, first_owner: int) -> int:
+    """Drop every part of a closure, and every reservation of owners for whom `is_dropped` (owners,) says so, which
+    begins with `first_owner`; return how many were reservations.
+    """
     dropped = 0
     for block in range(table.shape[0]):
         first, count = table[block, FIRST], table[block, COUNT]
         kept = 0
         for slot in range(first, first + count):
             owner = pool[slot, OWNER]
-            low, high = 0, owners.shape[0]
-            while low < high:
-                middle = (low + high) >> 1
-                if owners[middle] < owner:
-                    low = middle + 1
-                else:
-                    high = middle
-            if owner >= 0 and (low == owners.shape[0] or owners[low] != owner):
+            place = owner - first_owner
+            if owner >= 0 and not (0 <= place < is_dropped.shape[0] and is_dropped[place]):
                 move(pool, slot, first + kept)
                 kept += 1
             else:

@@ -31,7 +31,8 @@ LAST_STAMP = (1 << 30) - 1
 class Task(NamedTuple):
     """One request: blocks, departure window, terminal dwell, the greedy search's hover limit, in ms; its stamp.
 
-    `climb_out` is the dwell before the first link: none for a flight that is in the air already.
+    `climb_out` is the dwell before the first link: none for a flight that is in the air already. Nothing that gets to
+    the destination after `until` is looked for.
     """
 
     origin: int
@@ -41,6 +42,7 @@ class Task(NamedTuple):
     climb_out: int
     dwell: int
     hover_limit: int
+    until: int
     stamp: int
 
 

@@ -153,13 +153,13 @@ def safe_interval(
     if count == labels.shape[0]:
         return WORKSPACE_FULL, -1, 0
     landing = earliest_landing(links, table, pool, task, labels[0, G] + h)
-    if landing >= FAR_FUTURE:
+    if landing > min(task.until, FAR_FUTURE - 1):
         return NO_PATH, count, 0
     size = 0
     for label in range(count):
         size = open_label(heap, size, labels, label, max(labels[label, G] + h, landing), task.earliest)
     expansions = 0
-    bound = FAR_FUTURE
+    bound = task.until
     f_least = key_f(heap[0, KEY])
     while size > 0:
         key, label = heap[0, KEY], heap[0, ITEM]

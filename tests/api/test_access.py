@@ -328,6 +328,19 @@ def test_a_body_may_not_name_another_operator(api: Client, path: str) -> None:
     problem(response, 403, "operator-mismatch")
 
 
+@pytest.mark.parametrize(
+    ("members", "cause"),
+    [({"operator": "blue-kite"}, "operator-mismatch"), ({"priority": 1}, "priority-not-allowed")],
+)
+def test_an_item_of_a_batch_that_the_token_does_not_allow_is_named(
+    api: Client, members: dict[str, Any], cause: str
+) -> None:
+    items = [intent(**{"priority": 0, **members, "operator": "acme-air"}), intent(**members)]
+    answer = problem(api.post(f"{SUBMIT}/batch", json={"flight_intents": items}, **as_()), 403, "item-refused")
+    assert answer["cause"]["type"] == f"/problems/{cause}"
+    assert answer["index"] == (1 if "operator" in members else 0)
+
+
 def test_a_key_s_first_answer_is_found_whether_the_body_names_the_operator_or_not(api: Client) -> None:
     headers = {**as_()["headers"], "Idempotency-Key": "once"}
     unnamed = intent()
@@ -429,6 +442,13 @@ def test_a_stream_ends_when_the_token_expires(guarded: Settings, clock: FakeCloc
         token = issuer().token("ops", (MONITOR,), exp=int(time.time()) + 2)
         # httpx's transport without sockets returns when the answer is complete.
         assert api.get("/v1/airspace/stream", headers=bearer(token)).status_code == 200
+
+
+def test_an_item_of_a_batch_that_names_no_operator_is_named_where_nobody_is_told_from_another(client: Client) -> None:
+    nameless = {name: value for name, value in intent().items() if name != "operator"}
+    answer = client.post(f"{SUBMIT}/batch", json={"flight_intents": [intent(), nameless]})
+    (error,) = problem(answer, 422, "validation-error")["errors"]
+    assert error["loc"] == ["body", "flight_intents", 1, "operator"]
 
 
 def test_without_authentication_anybody_may_do_anything(client: Client) -> None:

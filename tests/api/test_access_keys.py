@@ -12,6 +12,7 @@ from typing import Any
 
 import anyio
 import pytest
+from structlog.testing import capture_logs
 
 from app import keys
 from app.errors import StartupError
@@ -164,6 +165,24 @@ def test_what_is_no_address_is_refused() -> None:
         keys.store_of(Settings(jwks="http://[::1"))
 
 
+@pytest.mark.parametrize(
+    ("place", "shown"),
+    [
+        ("https://user:hidden@keys.example.com/jwks.json?key=hidden", "https://keys.example.com/jwks.json"),
+        ("http://keys.example.com/jwks.json?key=hidden#hidden", "http://keys.example.com/jwks.json"),
+        ("https://user:hidden@[::1", "https://…"),
+        ("https://user:hid/den@keys.example.com", "https://…"),
+        ("https://hidden@xn--/", "https://…"),
+        ("http://127.0.0.1:9/jwks.json?key=hidden", "http://127.0.0.1:9/jwks.json"),
+    ],
+)
+def test_no_error_shows_a_secret_in_an_address(place: str, shown: str) -> None:
+    with pytest.raises(StartupError) as refusal:
+        keys.store_of(Settings(jwks=place))
+    assert str(refusal.value).startswith(f"AIRMATRIX_JWKS, {shown}: ")
+    assert "hid" not in str(refusal.value)
+
+
 # At an address
 
 
@@ -271,6 +290,21 @@ def test_a_bad_answer_leaves_the_keys(publisher: Publisher, status: int, content
     unknown, known = finds(store, "second", "first")
     assert (unknown, publisher.asked) == (None, 2)
     assert known is not None
+
+
+def test_no_address_has_a_user(publisher: Publisher) -> None:
+    with pytest.raises(StartupError, match="give no user or password"):
+        keys.store_of(Settings(jwks=publisher.url.replace("://", "://user:pw@")))
+
+
+def test_no_log_shows_a_query(publisher: Publisher) -> None:
+    monotonic = Monotonic()
+    store = KeyStore(f"{publisher.url}?key=hidden", 300, monotonic)
+    with capture_logs() as logged:
+        for now_s, content in ((11, b"{"), (22, key_set(SECOND).encode())):
+            publisher.content, monotonic.now_s = content, now_s
+            finds(store, "second")
+    assert [entry["jwks"] for entry in logged] == [publisher.url] * 2
 
 
 def test_an_address_is_asked_again_from_time_to_time(publisher: Publisher) -> None:

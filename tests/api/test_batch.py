@@ -1,7 +1,9 @@
 """POST /v1/flight-intents/batch: planned together, all of it recorded or nothing, and nobody else moved."""
 
 import asyncio
+import json
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -9,15 +11,16 @@ from typing import Any
 import httpx
 import pytest
 
-from app.batches import BatchOutcome
-from app.errors import ItemRefused, QueueFull
+from app.batches import Batches, BatchOutcome
+from app.errors import BatchNotPlanned, ItemRefused, QueueFull, TooManyRequests
 from app.flight_intents import State
 from app.main import create_app
+from app.service import Service
 from tests.api.bodies import SUBMIT, intent, problem, recorded
 from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import DEPARTURE_MS, LANES
 from tests.ledger.locations import SqliteLedgers
-from tests.ledger.process import FakeClock
+from tests.ledger.process import FakeClock, until
 
 BATCH = "/v1/flight-intents/batch"
 EAST, WEST = ("W", "E"), ("E", "W")
@@ -89,9 +92,24 @@ def test_one_bad_item_is_named_and_nothing_is_recorded(lanes: Client) -> None:
     assert listed(lanes) == []
 
 
-@pytest.mark.parametrize("count", [0, 501])
-def test_a_batch_has_1_to_500_flights(lanes: Client, count: int) -> None:
-    problem(post(lanes, *[lane(*EAST)] * count), 422, "validation-error")
+@pytest.mark.parametrize("flights", [0, 501])
+def test_a_batch_has_1_to_500_flights(lanes: Client, flights: int) -> None:
+    problem(post(lanes, *[lane(*EAST)] * flights), 422, "validation-error")
+
+
+def test_of_what_is_no_batch_no_more_is_looked_at_than_needed(lanes: Client) -> None:
+    def places(response: httpx.Response) -> list[list[object]]:
+        return [error["loc"] for error in problem(response, 422, "validation-error")["errors"]]
+
+    unknown: dict[str, Any] = {f"member {number}": 0 for number in range(50)}
+    assert places(post(lanes, lane(*EAST), **unknown)) == [["body", "member 0"]]
+    item = lane(*EAST, **unknown) | {"origin": unknown | lane(*EAST)["origin"]}
+    inside = ["body", "flight_intents", 0]
+    assert places(post(lanes, item)) == [[*inside, "origin", "member 0"], [*inside, "member 0"]]
+    too_many = lanes.post(BATCH, json={"flight_intents": [0] * 501})
+    assert (
+        problem(too_many, 422, "validation-error")["detail"] == "body: 501 flight_intents; a batch may have up to 500"
+    )
 
 
 def test_a_batch_has_one_priority(lanes: Client) -> None:
@@ -125,7 +143,14 @@ def test_the_same_key_brings_the_same_flights_again_as_they_are_now(lanes: Clien
 def submitted(client: Client, meanwhile: Any, *places: tuple[str, str], window_ms: int = 300_000) -> BatchOutcome:
     """Submit a batch and do something after what is reserved was looked at and before the batch is recorded."""
 
+    asked = 0
+
     def stop() -> bool:
+        nonlocal asked
+        asked += 1
+        if asked <= len(places):
+            # Each flight has to be planned once.
+            return False
         meanwhile()
         return True
 
@@ -162,19 +187,107 @@ def test_others_are_served_while_a_batch_is_planned_and_too_many_batches_are_tur
 
     def stop() -> bool:
         assert turned_away.wait(10)
-        return True
+        return False
 
     async def many() -> list[BatchOutcome | BaseException]:
         batches = lanes.service.batches
-        jobs = [asyncio.ensure_future(batches.submit([LANES.submission(*EAST)], 5.0, None, stop)) for _ in range(5)]
-        while not jobs[-1].done():
-            await asyncio.sleep(0.001)
+        jobs = [
+            asyncio.ensure_future(batches.submit([LANES.submission(*EAST, operator=operator)], 0.0, None, stop))
+            for operator in ("a-air", "a-air", "b-air", "c-air", "d-air", "e-air")
+        ]
+        await until(jobs[-1].done)
         turned_away.set()
         return await asyncio.gather(*jobs, return_exceptions=True)
 
     outcomes = lanes.portal.call(many)
-    assert [type(outcome) for outcome in outcomes] == [BatchOutcome] * 4 + [QueueFull]
+    assert [type(outcome) for outcome in outcomes] == [BatchOutcome, TooManyRequests, *[BatchOutcome] * 3, QueueFull]
     assert len(listed(lanes)) == 4
+    assert post(lanes, lane(*EAST, operator="a-air")).status_code == 201
+
+
+def slow_by(service: Service, seconds: int) -> Batches:
+    """Return batches for which so much time passes from one look at the clock to the next."""
+    deconfliction = service.deconfliction
+    clock = count(0, seconds).__next__
+    return Batches(service.writer, service.ledger, deconfliction._scheduler, deconfliction, clock)
+
+
+def test_a_batch_that_cannot_be_planned_in_time_is_refused_with_nothing_recorded(lanes: Client) -> None:
+    def batch() -> Any:
+        flights = [LANES.submission(*EAST)] * 2
+        return slow_by(lanes.service, 15).submit(flights, 0.0, None, lambda: False)
+
+    with pytest.raises(BatchNotPlanned, match="2 flight intents were not planned within 20 s"):
+        lanes.portal.call(batch)
+    with pytest.raises(BatchNotPlanned):
+        lanes.portal.call(lanes.service.batches.submit, [LANES.submission(*EAST)], 0.0, None, lambda: True)
+    assert listed(lanes) == []
+
+
+def test_others_do_not_wait_until_a_batch_is_planned_again(lanes: Client) -> None:
+    rivals: list[dict[str, Any]] = []
+
+    def reserve() -> bool:
+        if not rivals:
+            rivals.append(lanes.post(SUBMIT, json=lane(*EAST)).json())
+        return False
+
+    def batch() -> Any:
+        flights = [LANES.submission("V", "F"), LANES.submission(*EAST)]
+        return slow_by(lanes.service, 2).submit(flights, 0.0, None, reserve)
+
+    with pytest.raises(BatchNotPlanned, match="others have reserved"):
+        lanes.portal.call(batch)
+    assert listed(lanes) == [recorded(rivals[0])]
+    # What the flight that could have stayed held is free again.
+    assert lanes.post(SUBMIT, json=lane("V", "F")).json()["delay_s"] == 0
+
+
+def test_who_is_cancelled_leaves_the_planner_to_the_next(lanes: Client) -> None:
+    asked = 0
+
+    def watched() -> bool:
+        nonlocal asked
+        asked += 1
+        return False
+
+    async def cancelled() -> tuple[int, int]:
+        batches = lanes.service.batches
+        flights = [LANES.submission(*EAST), LANES.submission(*WEST)]
+        job = asyncio.ensure_future(batches.submit(flights, 5.0, None, watched))
+        await until(lambda: asked > len(flights))
+        job.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await job
+        before = asked
+        await batches.submit(flights[:1], 0.0, None, lambda: False)
+        return before, asked
+
+    before, after = lanes.portal.call(cancelled)
+    assert after == before
+    assert len(listed(lanes)) == 1
+
+
+def test_a_client_that_hangs_up_gives_its_turn_back(lanes: Client) -> None:
+    body = json.dumps({"flight_intents": [lane(*EAST), lane(*WEST)], "improve_for_s": 5}).encode()
+    messages = iter([{"type": "http.request", "body": body}, {"type": "http.disconnect"}])
+    sent: list[Any] = []
+
+    async def receive() -> Any:
+        return next(messages)
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    scope = {
+        "type": "http", "http_version": "1.1", "method": "POST", "scheme": "http", "path": BATCH, "root_path": "",
+        "query_string": b"", "headers": [(b"host", b"127.0.0.1"), (b"content-type", b"application/json")],
+        "state": {"service": lanes.service},
+    }  # fmt: skip
+    lanes.portal.call(create_app(lanes.service.settings, running=lanes.service), scope, receive, send)
+    assert json.loads(sent[1]["body"])["detail"] == "the connection ended before the batch was planned"
+    assert listed(lanes) == []
+    assert post(lanes, lane(*EAST)).status_code == 201
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
+from pathlib import Path
 from threading import Event, Thread, current_thread
 from threading import enumerate as all_threads
 from typing import Any
@@ -12,14 +13,16 @@ import httpx
 import pytest
 from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import OperationalError
+from structlog.testing import capture_logs
 
 from app.ledger_probe import LedgerProbe
 from app.main import create_app
 from app.service import Service, running
 from app.settings import Settings
 from tests.api.bodies import PROBLEM, SUBMIT, intent, problem
-from tests.api.serving import Client, served, serving
-from tests.ledger.locations import write_lock
+from tests.api.serving import Client, served, serving, settings_for
+from tests.ledger.district import OLD_TOWN
+from tests.ledger.locations import SqliteLedgers, write_lock
 from tests.ledger.process import FakeClock, until
 
 NOT_READY = PROBLEM | {"reason", "waiting", "revision"}
@@ -91,7 +94,7 @@ def test_a_service_whose_writer_has_crashed_is_not_ready(client: Client) -> None
 def test_a_service_whose_ledger_cannot_be_read_is_not_ready_and_says_how(client: Client) -> None:
     with failing("ledger-probe"):
         reason = not_ready(client.get("/health/ready"))
-    assert reason == ("the ledger cannot be read: disk I/O error", 0, None)
+    assert reason == ("the ledger cannot be read", 0, None)
     assert client.get("/health/ready").status_code == 200
 
 
@@ -101,7 +104,7 @@ def test_a_service_that_only_reads_is_not_ready_when_it_cannot(
     del client  # It has made the ledger this airspace's.
     with served(create_app(settings_with(settings, read_only=True), clock)) as reader, failing("ledger-probe"):
         reason = not_ready(reader.get("/health/ready"))
-    assert reason == ("the ledger cannot be read: disk I/O error", 0, None)
+    assert reason == ("the ledger cannot be read", 0, None)
 
 
 def test_a_service_whose_last_write_failed_is_not_ready_until_writes_work_again(client: Client) -> None:
@@ -109,7 +112,7 @@ def test_a_service_whose_last_write_failed_is_not_ready_until_writes_work_again(
     with failing("ledger-writer"):
         problem(client.post(SUBMIT, json=intent()), 503, "ledger-unavailable")
         reason, _, revision = not_ready(client.get("/health/ready"))
-    assert reason == "the last write failed: the ledger cannot be written: disk I/O error"
+    assert reason == "the last write failed"
     assert revision == 1
     assert client.post(SUBMIT, json=intent()).status_code == 201
     assert client.get("/health/ready").status_code == 200
@@ -128,10 +131,19 @@ def test_every_reason_is_told(client: Client) -> None:
         client.service.writer.stop()
         with failing("ledger-probe"):
             reason, _, _ = not_ready(client.get("/health/ready"))
-    assert reason == (
-        "the ledger writer has stopped; the last write failed: the ledger cannot be written: disk I/O error; "
-        "the ledger cannot be read: disk I/O error"
-    )
+    assert reason == "the ledger writer has stopped; the last write failed; the ledger cannot be read"
+
+
+def test_where_the_ledger_is_is_for_the_log_and_not_for_everybody(tmp_path: Path, clock: FakeClock) -> None:
+    ledger = SqliteLedgers(tmp_path).migrated()
+    path = Path(ledger)
+    with served(create_app(settings_for(OLD_TOWN, ledger, tmp_path), clock)) as client, capture_logs() as logged:
+        path.rename(path.with_suffix(".moved"))
+        problem(client.post(SUBMIT, json=intent()), 503, "ledger-unavailable")
+        response = client.get("/health/ready")
+    assert not_ready(response)[0] == "the last write failed; the ledger cannot be read"
+    assert str(tmp_path) not in response.text
+    assert any(str(path) in str(entry) for entry in logged if "health" in entry["event"])
 
 
 @asynccontextmanager

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from app.errors import TooManyRequests
 from app.limits import RateLimit
 from app.main import create_app
@@ -74,6 +76,28 @@ def test_operators_are_not_remembered_for_ever_nor_forgotten_while_they_must_wai
     assert spends(rate, "operator 999", 1) == 0
 
 
+def test_what_a_request_is_worth_beyond_itself_is_waited_for_afterwards() -> None:
+    clock = FakeClock()
+    rate = RateLimit(1.0, 3, clock)
+    rate.spend("acme-air")
+    rate.overdraw("acme-air", 4)
+    with pytest.raises(TooManyRequests):
+        rate.overdraw("acme-air", 1)
+    clock.advance(seconds=2)
+    assert spends(rate, "acme-air", 1) == 0
+    clock.advance(seconds=1)
+    assert spends(rate, "acme-air", 9) == 1
+
+
+def test_a_batch_counts_as_its_flight_intents(ledger: str, tmp_path: Path, clock: FakeClock) -> None:
+    with limited(ledger, tmp_path, clock, rate_per_s=0.1, rate_burst=2) as api:
+        batch = {"flight_intents": [intent()] * 5, "improve_for_s": 0}
+        assert api.post(f"{SUBMIT}/batch", json=batch, **as_()).status_code == 201
+        response = api.post(SUBMIT, json=intent(), **as_())
+        problem(response, 429, "too-many-requests")
+        assert response.headers["retry-after"] == "40"
+
+
 def test_who_asks_too_often_is_told_when_to_come_back(ledger: str, tmp_path: Path, clock: FakeClock) -> None:
     with limited(ledger, tmp_path, clock, rate_per_s=0.1, rate_burst=2) as api:
         first = api.post(SUBMIT, json=intent(), **as_())
@@ -88,6 +112,15 @@ def test_who_asks_too_often_is_told_when_to_come_back(ledger: str, tmp_path: Pat
         assert api.post(SUBMIT, json=other, **as_("blue-kite")).status_code == 201
         clock.advance(seconds=10)
         assert api.delete(first.headers["location"], **as_()).status_code == 200
+
+
+def test_who_subscribes_over_and_over_must_wait_too(ledger: str, tmp_path: Path, clock: FakeClock) -> None:
+    body = {"url": "https://receiver.example/", "kinds": ["intent"]}
+    with limited(ledger, tmp_path, clock, rate_per_s=0.1, rate_burst=1) as api:
+        webhook = api.post("/v1/webhooks", json=body, **as_()).headers["location"]
+        problem(api.post("/v1/webhooks", json=body, **as_()), 429, "too-many-requests")
+        problem(api.delete(webhook, **as_()), 429, "too-many-requests")
+        assert len(api.get("/v1/webhooks", **as_()).json()["items"]) == 1
 
 
 def test_strangers_do_not_use_up_an_operator_s_rate(ledger: str, tmp_path: Path, clock: FakeClock) -> None:

@@ -26,6 +26,7 @@ from app.ledger import CommitUncertain
 from app.main import create_app
 from app.metrics import Metrics
 from app.settings import Settings
+from app.tracing import _problem_in
 from app.writer import BatchReport, Request
 from planner.errors import NoDepartureSlot, NoPlan, NotPlannable, PathRefused
 from tests.api.bodies import PREVIEW, SUBMIT, intent
@@ -381,6 +382,13 @@ def test_the_reasons_of_readiness_are_no_labels(client: Client) -> None:
     with moving(client) as moved:
         client.get("/health/ready")
     assert moved == {**http("GET", "/health/ready", 503), **a_problem("not-ready")}
+
+
+def test_a_problem_is_told_from_its_beginning_however_it_goes_on() -> None:
+    kind = problems.KINDS[NoPlan]
+    begun = problems.body(kind, 'a "reason":"that is none" \\', {"reason": "no_departure_slot", "more": 1})
+    assert _problem_in(begun[:-10] + b"...") == (kind.slug, "no_departure_slot")
+    assert _problem_in(problems.body(kind, "none", {"cause": {"reason": "another's"}})) == (kind.slug, None)
 
 
 def test_an_unexpected_error_is_counted(settings: Settings, clock: FakeClock) -> None:

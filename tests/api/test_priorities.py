@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from app.main import create_app
@@ -188,6 +189,25 @@ def test_the_notice_is_a_setting(on_street: Settings, clock: FakeClock, notice_s
 
 
 @on_sqlite
+def test_the_first_answer_is_repeated_to_whom_was_displaced_since(street: Client) -> None:
+    one, all_ = {"Idempotency-Key": "one"}, {"Idempotency-Key": "all"}
+    batch = {"flight_intents": [along(window_ms=0, earliest_ms=DEPARTURE_MS + 600_000)], "improve_for_s": 0}
+
+    def first_or_again() -> list[httpx.Response]:
+        alone = street.post(SUBMIT, json=along(window_ms=0), headers=one)
+        return [alone, street.post(f"{SUBMIT}/batch", json=batch, headers=all_)]
+
+    first, together = first_or_again()
+    submit(street, 1, window_ms=0)
+    submit(street, 1, window_ms=0, earliest_ms=DEPARTURE_MS + 600_000)
+    again, together_again = first_or_again()
+    assert read(street, first.json()["id"])["state"] == "displaced"
+    assert (again.status_code, again.content) == (201, first.content)
+    assert (again.headers["etag"], again.headers["location"]) == (first.headers["etag"], first.headers["location"])
+    (item,), (item_again,) = (answer.json()["items"] for answer in (together, together_again))
+    assert (item_again["id"], item_again["state"]) == (item["id"], "displaced")
+
+
 def test_cancelling_who_was_displaced_ends_it(street: Client) -> None:
     first = submit(street, window_ms=0)
     submit(street, 1)

@@ -159,6 +159,51 @@ def test_another_host_is_refused_on_every_path(client: Client, host: str) -> Non
         problem(client.get(path, headers={"Host": host}), 421, "host-not-allowed")
 
 
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site", "Origin": "http://127.0.0.1:3000"},
+        {"Origin": "https://airmatrix.example"},
+        {"Origin": "http://127.0.0.1.example"},
+        {"Origin": "null"},
+    ],
+)
+def test_a_page_of_another_site_changes_nothing(client: Client, headers: dict[str, str]) -> None:
+    flight = client.post(SUBMIT, json=intent()).headers["location"]
+    problem(client.post(f"{flight}/activate", headers=headers), 403, "cross-site-request")
+    problem(client.delete(flight, headers=headers), 403, "cross-site-request")
+    assert client.get(flight, headers=headers).json()["version"] == "1"
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1"},
+        {"Sec-Fetch-Site": "none"},
+        {"Origin": "http://localhost:8000"},
+        {"Origin": "http://[::1]:8000"},
+    ],
+)
+def test_the_service_s_own_pages_change_what_they_like(client: Client, headers: dict[str, str]) -> None:
+    flight = client.post(SUBMIT, json=intent()).headers["location"]
+    assert client.post(f"{flight}/activate", headers=headers).status_code == 200
+
+
+def test_a_page_from_the_host_that_is_asked_is_the_service_s_own(settings: Settings, clock: FakeClock) -> None:
+    with served(create_app(settings.model_copy(update={"allow_unauthenticated": True}), clock)) as client:
+        own, other = (
+            {"Host": "uss.example:8000", "Origin": f"http://{origin}"} for origin in ("uss.example:8000", "uss.example")
+        )
+        assert client.post(SUBMIT, json=intent(), headers=own).status_code == 201
+        problem(client.post(SUBMIT, json=intent(), headers=other), 403, "cross-site-request")
+
+
+def test_nobody_is_sent_elsewhere_for_a_slash_too_many(client: Client) -> None:
+    for method in ("GET", "POST"):
+        problem(client.request(method, f"{SUBMIT}/"), 404, "not-found")
+
+
 def test_any_host_is_served_where_that_was_asked_for(settings: Settings, clock: FakeClock) -> None:
     with served(create_app(settings_with(settings, allow_unauthenticated=True), clock)) as client:
         assert client.get("/health/live", headers={"Host": "airmatrix.example"}).status_code == 200

@@ -471,6 +471,7 @@ def test_what_is_not_json_is_malformed(client: Client, content: bytes) -> None:
         ('{"positions": {}}', ["body", "positions"]),
         ('{"positions": "here"}', ["body", "positions"]),
         ('{"positions": [], "operator": "acme-air"}', ["body", "operator"]),
+        ('{"positions": [], "one": 1, "two": 2}', ["body", "one"]),
     ],
 )
 def test_what_is_no_report_is_refused_by_name(client: Client, content: str, loc: list[str]) -> None:

@@ -53,7 +53,8 @@ def intent_with(member: str, value: object) -> dict[str, Any]:
 def one_error(response: Any, *loc: str) -> str:
     """Return the message of the one thing that is wrong, after checking where."""
     document = problem(response, 422, "validation-error")
-    assert set(document) == PROBLEM | {"errors"}
+    assert set(document) == PROBLEM | {"errors", "error_count"}
+    assert document["error_count"] == 1
     (error,) = document["errors"]
     assert set(error) == {"loc", "msg", "type"}
     assert error["loc"] == ["body", *loc]
@@ -395,3 +396,10 @@ def test_a_body_that_announces_an_absurd_length_is_refused(client: Client) -> No
 
 def test_the_size_is_bounded_on_every_path(client: Client) -> None:
     problem(client.request("PATCH", "/nowhere", content=padded(LIMIT + 1)), 413, "body-too-large")
+
+
+def test_the_first_hundred_errors_are_told_and_how_many_there_are(client: Client) -> None:
+    answer = problem(client.post(SUBMIT, json={"trajectory": [0] * 300}), 422, "validation-error")
+    assert len(answer["errors"]) == 100
+    assert answer["error_count"] > 300
+    assert answer["detail"].endswith(f"(and {answer['error_count'] - 1} more)")

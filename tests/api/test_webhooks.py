@@ -3,18 +3,22 @@
 import asyncio
 import hashlib
 import ssl
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import httpx
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from structlog.testing import capture_logs
 
+from app import webhook_delivery
 from app.errors import LedgerUnavailable, WebhookRefused
 from app.ledger import Transaction
 from app.main import create_app
@@ -218,6 +222,91 @@ def test_what_fails_for_a_day_is_given_up_and_the_next_gets_its_try(
     assert attempts(still) == {"failed": 2, "given_up": 1, "delivered": 1}
 
 
+def test_that_deliveries_fail_is_logged_when_it_begins_and_when_it_ends(
+    still: Client, receiver: Receiver, clock: FakeClock
+) -> None:
+    webhook = subscribe(still, receiver.url)
+    submit(still)
+    submit(still, "V", "F")
+    mail = deliverer(still)
+    with capture_logs() as logged:
+        for status in (500, 500, 200):
+            receiver.verdict = lambda _, status=status: status  # type: ignore[misc]
+            deliver(mail)
+            clock.advance(seconds=4)
+    told = [(entry["event"], entry["webhook"], entry["log_level"]) for entry in logged if "webhook" in entry]
+    assert told == [
+        ("webhook deliveries fail", webhook["id"], "warning"),
+        ("webhook deliveries work again", webhook["id"], "warning"),
+    ]
+    assert attempts(still) == {"failed": 4, "delivered": 2}
+
+
+class SlowPost(Post):
+    """Keeps the order in which events come to hosts; each takes as long as `take` says."""
+
+    def __init__(self, take: Callable[[str], Awaitable[object]]) -> None:
+        super().__init__(LOCAL)
+        self.hosts: list[str] = []
+        self._take = take
+
+    async def __call__(self, text: str, content: bytes, headers: dict[str, str]) -> None:
+        del content, headers
+        host = httpx.URL(text).host
+        self.hosts.append(host)
+        await self._take(host)
+
+
+def delivering_by(client: Client, post: Post) -> Deliverer:
+    service = client.service
+    return Deliverer(service.ledger, service.writer, service.clock, post)
+
+
+def test_receivers_that_hang_take_no_more_than_their_operators_lanes(still: Client) -> None:
+    for operator in ("slow", "slower"):
+        for number in range(8):
+            subscribe(still, f"https://{operator}.example/{number}", operator=operator)
+    subscribe(still, "https://quick.example/", operator="quick")
+    for number in range(4):
+        for operator, lane, end in (("slow", "W", "E"), ("slower", "V", "F")):
+            submit(still, lane, end, operator=operator, earliest_ms=DEPARTURE_MS + number * 600_000)
+    submit(still, operator="quick", earliest_ms=DEPARTURE_MS + 3_600_000)
+    told = asyncio.Event()
+
+    async def take(host: str) -> None:
+        if host != "quick.example":
+            await asyncio.Event().wait()
+        told.set()
+
+    post = SlowPost(take)
+    mail = delivering_by(still, post)
+
+    async def deliver_once() -> None:
+        under_way = await mail.look()
+        await asyncio.wait_for(told.wait(), 10)
+        for lane in under_way:
+            lane.cancel()
+
+    asyncio.run(deliver_once())
+    assert Counter(post.hosts) == {"slow.example": 16, "slower.example": 16, "quick.example": 1}
+
+
+def test_where_lanes_are_short_they_go_round(still: Client, clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhook_delivery, "_MOST_LANES", 1)
+    for operator, flights in (("slow", 3), ("quick", 1)):
+        subscribe(still, f"https://{operator}.example/", operator=operator)
+        for number in range(flights):
+            lane, end = ("W", "E") if operator == "slow" else ("V", "F")
+            submit(still, lane, end, operator=operator, earliest_ms=DEPARTURE_MS + number * 600_000)
+
+    async def take(host: str) -> None:
+        clock.advance(seconds=4 if host == "slow.example" else 0)
+
+    post = SlowPost(take)
+    deliver(delivering_by(still, post))
+    assert post.hosts == ["slow.example", "quick.example", "slow.example", "slow.example"]
+
+
 def test_after_a_crash_only_what_was_on_its_way_comes_again(
     still: Client, on_lanes: Settings, receiver: Receiver, clock: FakeClock
 ) -> None:
@@ -366,6 +455,15 @@ def test_a_webhook_without_events_keeps_up_with_the_journal(still: Client, recei
         ("https://[::ffff:127.0.0.1]/", PUBLIC),
         ("https://[64:ff9b::7f00:1]/", PUBLIC),
         ("https://[2002:7f00:1::]/", PUBLIC),
+        ("https://[3fff::1]/", PUBLIC),
+        ("https://[3fff:fff::1]/", PUBLIC),
+        ("https://[2001:1::1]/", PUBLIC),
+        ("https://192.0.0.9/", PUBLIC),
+        ("https://192.0.0.10/", PUBLIC),
+        ("https://192.88.99.1/", PUBLIC),
+        ("https://[::ffff:192.88.99.1]/", PUBLIC),
+        ("https://xn--/", LOCAL),
+        ("https://xn--a/", LOCAL),
         ("https://[fe80::1]/", PUBLIC),
         ("https://[fd00::1]/", PUBLIC),
         ("https://169.254.169.254/", PUBLIC),
@@ -402,8 +500,18 @@ def test_others_are_not(url: str, destinations: Destinations) -> None:
 @pytest.mark.parametrize("host", ["2130706433", "0x7f.1", "127.1"])
 def test_a_name_that_leads_to_a_private_address_is_found_out_on_delivery(host: str, receiver: Receiver) -> None:
     port = httpx.URL(receiver.url).port
-    with pytest.raises(DeliveryFailed, match="has an address that is not public"):
+    with pytest.raises(DeliveryFailed, match="has no address, or one that nothing may be sent to"):
         asyncio.run(Post(PUBLIC)(f"https://{host}:{port}/", b"{}", {}))
+
+
+def test_nobody_finds_out_which_names_there_are_behind_the_service() -> None:
+    said = set()
+    # The one leads to this machine, the other (RFC 6761) nowhere.
+    for host in ("127.1", "nobody.invalid"):
+        with pytest.raises(DeliveryFailed) as failure:
+            asyncio.run(Post(PUBLIC)(f"https://{host}/", b"{}", {}))
+        said.add(str(failure.value).replace(host, "host"))
+    assert len(said) == 1
 
 
 def test_loopback_is_for_services_without_authentication_that_only_listen_there() -> None:
@@ -521,6 +629,13 @@ def test_nothing_goes_to_a_webhook_that_was_removed(still: Client, receiver: Rec
     assert receiver.deliveries == []
     problem(still.delete(f"{WEBHOOKS}/{webhook['id']}"), 404, "unknown-webhook")
     assert still.get(WEBHOOKS).json() == {"items": [], "next_cursor": None}
+
+
+def test_to_remove_what_there_is_not_is_no_work_for_the_writer(still: Client) -> None:
+    subscribe(still, "https://receiver.example/")
+    still.service.writer.stop()
+    for nobody in (uuid4(), "%00", "one"):
+        problem(still.delete(f"{WEBHOOKS}/{nobody}"), 404, "unknown-webhook")
 
 
 def test_with_authentication_a_webhook_is_its_operator_s(ledger: str, tmp_path: Path, clock: FakeClock) -> None:

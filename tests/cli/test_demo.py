@@ -44,7 +44,7 @@ class Demo:
         while "console" not in self.out:
             assert self.process.poll() is None, self.err
             assert time.monotonic() < until
-            time.sleep(0.05)
+            time.sleep(0.001)
         (row,) = [line for line in self.out.splitlines() if "console" in line]
         return row.strip("│ ").split()[-1]
 

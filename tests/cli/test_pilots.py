@@ -16,7 +16,7 @@ import pytest
 
 from app.client import Client, ServiceUnreachable, UnexpectedAnswer
 from app.commands import pilots as pilots_module
-from app.commands.deviations import Deviations, Kind
+from app.commands.deviations import Deviations, Flown, Kind
 from app.commands.pilots import Dispatch, Pilots, Report, ServiceTime
 from app.flight_intents import State
 from app.routes.answers import FlightIntentAnswer
@@ -48,7 +48,7 @@ def intent(
     return FlightIntentAnswer.model_validate(
         wish
         | {
-            "id": f"flight-{sequence}", "sequence": sequence, "version": "1", "state": state.value,
+            "id": f"flight-{sequence}", "sequence": sequence, "version": "1", "state": state.value, "submitted": False,
             "origin": points[0], "destination": points[-1], "latest_departure": departure_ms,
             "departure": times[0], "arrival": times[-1], "reservations": [],
             "trajectory": [point | {"arrive": at, "depart": at} for point, at in zip(points, times, strict=True)],
@@ -77,13 +77,20 @@ class StandIn:
     def __post_init__(self) -> None:
         self.clock = ServerClock(START_MS, self.rate)
 
-    def tell(self, kind: State, answer: FlightIntentAnswer) -> None:
-        """Write to the journal."""
-        revision = len(self.journal) + 1
-        self.journal.append(
-            {"revision": revision, "time": format_time(self.clock()), "kind": kind.value,
-             "flight_intent_id": answer.id, "sequence": answer.sequence, "track_id": None, "reasons": []}
-        )  # fmt: skip
+    @property
+    def revision(self) -> int:
+        """The journal's newest revision."""
+        return max((entry["revision"] for entry in self.journal), default=0)
+
+    def tell(self, kind: State, *answers: FlightIntentAnswer, is_new_plan: bool = False) -> None:
+        """Write to the journal, all in one revision."""
+        revision, at = self.revision + 1, format_time(self.clock())
+        details = {"cause": {"constraint_id": "closed"}, "reason": None} if is_new_plan else {}
+        self.journal += [
+            {"revision": revision, "time": at, "kind": kind.value, "flight_intent_id": answer.id,
+             "sequence": answer.sequence, "track_id": None, "reasons": [], "details": details}
+            for answer in answers
+        ]  # fmt: skip
 
     def answer(self, request: httpx.Request) -> httpx.Response:
         """Answer as the service does."""
@@ -101,10 +108,11 @@ class StandIn:
             clock = {"now": now, "rate": self.rate, "simulated": True}
             return httpx.Response(200, json={"at": now, "clock": clock, "items": []})
         if path == "/health/ready":
-            return httpx.Response(200, json={"mode": "read-write", "revision": len(self.journal), "waiting": 0})
+            return httpx.Response(200, json={"mode": "read-write", "revision": self.revision, "waiting": 0})
         if path == "/v1/events":
             after = int(request.url.params["after"])
-            return httpx.Response(200, json={"items": self.journal[after:], "next_cursor": None, "removed_through": 0})
+            items = [entry for entry in self.journal if entry["revision"] > after]
+            return httpx.Response(200, json={"items": items, "next_cursor": None, "removed_through": 0})
         if path == "/v1/flight-intents":
             assert parse_time(request.url.params["from"]) >= START_MS
             items = [each.model_dump(mode="json") for each in self.intents]
@@ -255,6 +263,84 @@ def test_a_flight_that_is_cancelled_in_the_air_flies_to_its_end() -> None:
     assert service.heard("flight-1")[-1]["airborne"] is False
 
 
+def test_a_flight_that_is_moved_is_activated_and_flown_as_it_is_planned_now() -> None:
+    moved = intent(1, 120)
+    service = StandIn([intent(1, 60)])
+
+    def until(pilots: Pilots) -> bool:
+        if not service.journal:
+            service.intents[:] = [moved]
+            service.tell(State.ACCEPTED, moved, is_new_plan=True)
+        return pilots.unfinished == 0
+
+    assert fly(service, until=until).arrived == 1
+    heard = service.heard("flight-1")
+    assert times(heard)[0] >= 110_000
+    assert {time_ms for time_ms, position in zip(times(heard), heard, strict=True) if position["airborne"]} <= set(
+        range(120_000, 120_000 + FLIGHT_MS)
+    )
+    (activated,) = service.asked
+    assert activated[1] >= START_MS + 110_000
+
+
+def test_a_flight_that_is_displaced_stays_where_it_is_until_it_is_planned_again() -> None:
+    first, second = intent(1, 60), intent(2, 80, row=2)
+    service = StandIn([first, second])
+    again = intent(1, 200)
+
+    def until(pilots: Pilots) -> bool:
+        if not service.journal:
+            service.intents[:] = [intent(1, 60, state=State.DISPLACED, trajectory=[]), second]
+            service.tell(State.DISPLACED, first, is_new_plan=True)
+        if len(service.journal) == 1 and pilots.report.arrived == 1 and pilots.unfinished == 0:
+            assert service.heard("flight-1") == []
+            service.intents[0] = again
+            service.tell(State.ACCEPTED, again, is_new_plan=True)
+        return pilots.report.arrived == 2
+
+    fly(service, until=until)
+    assert times(service.heard("flight-1"))[0] >= 190_000
+    assert [what for what, _ in service.asked] == ["activate flight-2", "activate flight-1"]
+
+
+def test_a_flight_in_the_air_goes_where_it_is_sent_now() -> None:
+    detour = intent(1, -1, row=3, state=State.ACTIVATED)
+    service = StandIn([intent(1, -1, state=State.ACTIVATED)], rate=20)
+
+    def until(pilots: Pilots) -> bool:
+        if not service.journal and service.reports:
+            service.intents[:] = [detour]
+            service.tell(State.ACTIVATED, detour, is_new_plan=True)
+        return pilots.unfinished == 0
+
+    assert fly(service, until=until).arrived == 1
+    heard = service.heard("flight-1")
+    y = [float(GRID.project(position["lon"], position["lat"])[1]) - GRID.origin_y_m for position in heard]
+    assert y[0] == pytest.approx(30, abs=0.01)
+    assert y[-1] == pytest.approx(70, abs=0.01)
+    assert service.asked == []
+
+
+def test_of_events_of_one_revision_none_is_missed_where_reading_fails_among_them() -> None:
+    first, second = intent(1, 200), intent(2, 200, row=2)
+    failures = iter(range(1))
+
+    def refuse(request: httpx.Request) -> httpx.Response | None:
+        if request.url.path.endswith("/flight-2") and next(failures, None) is not None:
+            return httpx.Response(503, json={"type": "/problems/queue-full", "title": "Busy"})
+        return None
+
+    service = StandIn([], on_request=refuse)
+
+    def until(pilots: Pilots) -> bool:
+        if not service.journal:
+            service.intents += [first, second]
+            service.tell(State.ACCEPTED, first, second)
+        return pilots.report.arrived == 2
+
+    assert fly(service, until=until).refused == {"queue-full": 1}
+
+
 def test_of_one_operator_only_its_own_flights_are_flown() -> None:
     mine, other = intent(1, 60, operator="medlift"), intent(2, 60, row=2)
     asked_for = []
@@ -310,12 +396,19 @@ def test_an_aircraft_that_is_heard_again_only_after_it_landed_says_so() -> None:
     assert [what for what, _ in service.asked] == ["activate flight-1"]
 
 
+def flown(dispatch: Dispatch) -> Flown:
+    """Return what becomes of the flight that was found first."""
+    _, aircraft = dispatch.found.get()
+    assert aircraft is not None
+    return aircraft.flown
+
+
 def seed_where(*, for_good: bool) -> int:
     """Return a seed with which flight 1 is lost for good, or is not."""
     with Client("http://town", transport=httpx.MockTransport(StandIn([intent(1, 12)]).answer)) as client:
         for seed in range(50):
             dispatch = Dispatch(client, ServiceTime(client), GRID, Deviations(seed, (Kind.LOST,), first=1), None)
-            if (dispatch.found.get().flown.silent_until_ms is None) == for_good:
+            if (flown(dispatch).silent_until_ms is None) == for_good:
                 return seed
     raise AssertionError("no such seed")
 

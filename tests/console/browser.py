@@ -1,7 +1,8 @@
 """Debian's chromium with WebGL in software, driven by Playwright; and what a page has to say for itself."""
 
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal
@@ -79,6 +80,17 @@ class Watched:
         picture = np.asarray(Image.open(BytesIO(self.page.locator("#map").screenshot())).convert("RGB"))
         self.run("() => document.getElementById('tags').style.visibility = ''")
         return picture[10:-60, 230:-70].astype(np.int64)
+
+    def until(self, colour: Callable[[npt.NDArray[np.int64]], int], is_enough: Callable[[int], bool]) -> int:
+        """Wait until the map shows enough of a colour and stands still, and return in how many pixels."""
+        before, give_up = -1, time.monotonic() + PATIENCE_MS / 1000
+        while True:
+            number = colour(self.pixels())
+            # Aircraft move on a little.
+            if is_enough(number) and abs(number - before) <= 0.05 * number:
+                return number
+            assert time.monotonic() < give_up, f"{colour.__name__}: {number} pixels"
+            before = number
 
     def _note(self, kind: str, text: str) -> None:
         if kind in ("error", "warning"):

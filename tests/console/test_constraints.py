@@ -33,14 +33,12 @@ def closed(served: Quarter, **members: Any) -> Iterator[None]:
 
 def test_closed_airspace_comes_and_goes_on_the_map_and_in_the_list(console: Watched, served: Quarter) -> None:
     page = console.page
-    page.wait_for_timeout(500)
-    before = vermilion(console.pixels())
+    before = console.until(vermilion, lambda _: True)
     with closed(served):
         item = page.locator("#constraints-list button", has_text="<b>Parade</b>")
         item.wait_for()
         assert item.locator("span").inner_text() == "0–80 m, for good"
-        page.wait_for_timeout(700)
-        assert vermilion(console.pixels()) > before + 1000
+        console.until(vermilion, lambda number: number > before + 1000)
         assert page.locator("#latest").inner_text().startswith("airspace closed at 08:0")
         item.click()
         page.locator("#map canvas.maplibregl-canvas").hover()
@@ -48,8 +46,7 @@ def test_closed_airspace_comes_and_goes_on_the_map_and_in_the_list(console: Watc
         page.locator("#map canvas.maplibregl-canvas").click()
         page.locator("#details .hint", has_text="Closed: <b>Parade</b>.").wait_for()
     item.wait_for(state="detached")
-    page.wait_for_timeout(700)
-    assert vermilion(console.pixels()) < before + 200
+    console.until(vermilion, lambda number: number < before + 200)
     assert console.complaints == []
 
 

@@ -35,15 +35,12 @@ def test_a_deviation_turns_its_block_yellow_then_red(browser: "Browser", tmp_pat
 
         served.report((0, 5, 0), flight_intent_id=stray["id"])
         page.locator("#count-yellow b").filter(has_not_text="0").wait_for()
-        page.wait_for_timeout(500)
-        strayed = console.pixels()
-        assert yellow(strayed) > _MANY
-        assert vermilion(strayed) < _FEW
+        console.until(yellow, lambda number: number > _MANY)
+        assert vermilion(console.pixels()) < _FEW
 
         served.report((2, 8, 0), flight_intent_id=stray["id"])
         page.locator("#count-red b").filter(has_not_text="0").wait_for()
-        page.wait_for_timeout(500)
-        assert vermilion(console.pixels()) > _MANY
+        console.until(vermilion, lambda number: number > _MANY)
         assert page.locator("#announcer").inner_text().startswith(("red alert", "2 new alerts"))
 
         # The alert leads there; a click on the block says why.

@@ -13,7 +13,7 @@ from app.deconfliction import Deconfliction, IdempotencyKey, Outcome
 from app.flight_intents import FlightIntent, Submission
 from app.ledger import open_ledger
 from app.replica import OccupancyReplica
-from app.scheduling import Periods, Scheduler
+from app.scheduling import Limits, Scheduler
 from app.writer import BatchReport, Policy, Writer
 from planner.aircraft import shipped_aircraft_types
 from planner.airspace import Airspace
@@ -28,7 +28,7 @@ Hold = tuple[int, int, int]  # block, enter, exit
 DAY_MS = 86_400_000
 HORIZON_MS = 30 * DAY_MS
 POLICY = Policy(idempotency_ms=DAY_MS, queue_limit=1024)
-PERIODS = Periods(HORIZON_MS)
+PERIODS = Limits(HORIZON_MS)
 
 
 @dataclass
@@ -62,12 +62,12 @@ class Process:
         observers: Sequence[Callable[[BatchReport], None]] = (),
         on_death: Callable[[], None] = lambda: None,
         policy: Policy = POLICY,
-        periods: Periods = PERIODS,
+        limits: Limits = PERIODS,
         search: Search = Search.SAFE_INTERVAL,
     ) -> None:
         self.location = location
         self.ledger = open_ledger(location, airspace, claim=True)
-        self.planner = Planner(airspace, search)
+        self.planner = Planner(airspace, search, detour_limit_ms=300_000)
         performances = {type_.id: Performance.of(type_, airspace.grid) for type_ in shipped_aircraft_types()}
         self.writer = Writer(
             self.ledger,
@@ -78,7 +78,7 @@ class Process:
             observers=observers,
             on_death=on_death,
         )
-        scheduler = Scheduler(self.planner, performances, periods)
+        scheduler = Scheduler(self.planner, performances, limits)
         self.deconfliction = Deconfliction(self.writer, self.ledger, scheduler, freshness_ms=5_000)
         self.writer.start()
 

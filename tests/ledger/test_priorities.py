@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Engine, event
 from sqlalchemy.exc import IntegrityError, OperationalError
+from structlog.testing import capture_logs
 
 from app.commands.verify import checked
 from app.constraints import Constraint
@@ -21,7 +22,7 @@ from app.errors import IllegalTransition, LedgerUnavailable, PreconditionFailed,
 from app.flight_intents import Displacement, FlightIntent, State, Submission
 from app.ledger import JournalEntry
 from app.replica import OccupancyReplica
-from app.scheduling import Periods
+from app.scheduling import Limits
 from planner.aircraft import shipped_aircraft_types
 from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import Block, NoPlan, PlannerError
@@ -39,12 +40,12 @@ from tests.ledger.process import (
     content,
     reserved,
 )
-from tests.ledger.test_writer import commit_and_fail, on_next_commit
+from tests.ledger.test_writer import commit_and_fail, fail, on_next_commit
 
 YARD = district(".....\n..#..\n.....", ".....\n.....\n.....")
 # All flights begin and end in the lower layer, so that they meet.
 GROUND: list[Block] = [YARD.airspace.grid.block(block) for block in range(15) if not YARD.airspace.occupied[block]]
-PERIODS = Periods(HORIZON_MS, notice_ms=20_000, lead_ms=2_000)
+PERIODS = Limits(HORIZON_MS, notice_ms=20_000, lead_ms=2_000)
 PERFORMANCE = {
     type_.id: Performance.of(type_, YARD.airspace.grid) for type_ in shipped_aircraft_types() if type_.id == AIRCRAFT
 }
@@ -382,8 +383,8 @@ def test_whatever_happens_only_who_may_be_moved_is_moved_and_nobody_overlaps(
 ) -> None:
     clock, location = FakeClock(), ledgers.migrated()
     with (
-        Process(location, YARD.airspace, clock, periods=PERIODS) as one,
-        Process(location, YARD.airspace, clock, periods=PERIODS) as other,
+        Process(location, YARD.airspace, clock, limits=PERIODS) as one,
+        Process(location, YARD.airspace, clock, limits=PERIODS) as other,
     ):
         world = World((one, other), clock)
         for verb, *arguments in flights + steps:
@@ -652,3 +653,34 @@ def test_who_made_way_for_a_change_is_told_also_where_the_commit_was_lost(street
         outcome = asyncio.run(street.deconfliction.change(second.id, along(1), frozenset({second.version})))
     assert isinstance(outcome, Outcome)
     assert [flight.id for flight in outcome.displaced] == [first.id]
+
+
+def test_a_change_whose_commit_was_lost_is_not_taken_for_one_that_was_there_before(street: Process) -> None:
+    first = submitted(street, along()).intent
+    with on_next_commit(fail), pytest.raises(LedgerUnavailable):
+        asyncio.run(street.deconfliction.change(first.id, along(), None))
+    assert everything(street)[1].version == first.version
+
+
+def test_a_flight_in_the_air_can_be_changed_twice_at_once(street: Process, clock: FakeClock) -> None:
+    flight = submitted(street, along()).intent
+    asyncio.run(street.deconfliction.activate(flight.id))
+    clock.advance(seconds=(DEPARTURE_MS - clock.now_ms) / 1000 + 1)
+    changes = [street.deconfliction.change(flight.id, along(), None) for _ in range(2)]
+    with capture_logs() as logs:
+        outcomes = street.together(*changes)
+    assert [outcome.intent.version for outcome in outcomes] == [3, 4]
+    assert not [entry for entry in logs if entry["event"].startswith("batch is written again")]
+    assert_sound(street)
+
+
+def test_of_too_many_that_have_to_make_way_at_once_the_last_are_displaced(ledger: str, clock: FakeClock) -> None:
+    limits = Limits(HORIZON_MS, most_expansions=0)
+    with Process(ledger, STREET.airspace, clock, limits=limits) as process:
+        for _ in range(3):
+            submitted(process, along())
+        outcome = submitted(process, replace(STREET.submission("E", "W"), priority=1))
+        told = [(flight.sequence, flight.state, flight.reason) for flight in outcome.displaced]
+        assert told[0] == (1, State.ACCEPTED, None)
+        assert set(told[1:]) == {(2, State.DISPLACED, "too_many_at_once"), (3, State.DISPLACED, "too_many_at_once")}
+        assert_sound(process)

@@ -86,14 +86,16 @@ def test_only_the_first_event_of_a_flight_intent_is_due(opened: Ledger) -> None:
 def test_what_failed_is_due_at_its_time_and_the_webhook_fails_until_then(opened: Ledger) -> None:
     webhook = add(opened)
     take(opened, webhook, (1, 0, 7), (2, 0, 8), through=2)
-    write(opened, lambda rows: rows.failed(Waiting(webhook.number, 7, 1, 0, 0), "answered 500", NOW + 1_000, NOW))
+    first, other = Waiting(webhook.number, 7, 1, 0, 0), Waiting(webhook.number, 8, 2, 0, 0)
+    assert write(opened, lambda rows: rows.failed(first, "answered 404", NOW, NOW))
+    assert not write(opened, lambda rows: rows.failed(first, "answered 500", NOW + 1_000, NOW + 1))
     assert due(opened, webhook, NOW + 999) == [(2, 0, 8)]
-    write(opened, lambda rows: rows.delivered(Waiting(webhook.number, 8, 2, 0, 0), NOW + 1))
+    assert not write(opened, lambda rows: rows.delivered(other, NOW + 1))
     (found,) = read(opened, lambda rows: rows.page())
     assert (found.failing_since_ms, found.last_error) == (NOW, "answered 500")
     (again,) = read(opened, lambda rows: rows.due(webhook.number, NOW + 1_000, 10))
     assert again.attempts == 1
-    write(opened, lambda rows: rows.delivered(again, NOW + 1_000))
+    assert write(opened, lambda rows: rows.delivered(again, NOW + 1_000))
     (found,) = read(opened, lambda rows: rows.page())
     assert (found.failing_since_ms, found.last_delivery_ms) == (None, NOW + 1_000)
 

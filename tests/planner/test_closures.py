@@ -165,3 +165,31 @@ def test_a_planner_can_be_asked_about_another_index_than_its_own() -> None:
     request = flight(sketch["A"], sketch["B"], earliest=0, latest=600)
     assert planner.plan(request).arrival_ms > 500
     assert planner.plan(request, planner.index.without(np.array([1]))).departure_ms == 0
+
+
+def test_a_flight_whose_destination_is_closed_for_long_is_refused_at_once_where_detours_are_bounded() -> None:
+    sketch = drawn("A.B")
+    planner = Planner(sketch.airspace, detour_limit_ms=100)
+    planner.index.close({1: Closure(*columns((2, 0, 5_000)))})
+    with pytest.raises(NoConflictFreePath) as refused:
+        planner.plan(flight(sketch["A"], sketch["B"], earliest=0, latest=10))
+    assert refused.value.conflicting_owners == (-1,)
+    assert refused.value.expansions < 5
+    departure = refused.value.earliest_feasible_departure_ms
+    assert departure is not None
+    assert planner.plan(flight(sketch["A"], sketch["B"], earliest=departure)).arrival_ms >= 5_000
+
+
+@pytest.mark.parametrize(("limit", "is_refused"), [(98, True), (99, False)])
+def test_a_flight_is_in_the_air_for_so_much_longer_than_alone_and_no_longer(limit: int, is_refused: bool) -> None:
+    """It has to leave its pad by 1, and cannot land before 108: 107 ms for what takes 8 without traffic."""
+    sketch = drawn("A.B")
+    planner = Planner(sketch.airspace, detour_limit_ms=limit)
+    planner.index.reserve(*columns((0, 6, 9), (2, 0, 104)), 1)
+    request = flight(sketch["A"], sketch["B"], earliest=0, latest=8)
+    if is_refused:
+        with pytest.raises(NoConflictFreePath):
+            planner.plan(request)
+    else:
+        plan = planner.plan(request)
+        assert (plan.departure_ms, plan.arrival_ms) == (1, 108)

@@ -382,7 +382,9 @@ def test_volumes_that_nobody_can_fly_in_are_refused(
 
 
 def test_an_aircraft_that_must_land_before_it_is_through_cannot_fly_there() -> None:
-    assert through(LANE, *WIDE, endurance_ms=8).depart_ms[-1] == 39
+    assert through(LANE, *WIDE, endurance_ms=39).depart_ms[-1] == 39
+    with pytest.raises(BeyondEndurance):
+        through(LANE, *WIDE, endurance_ms=38)
     with pytest.raises(NotFlyable):
         through(LANE, *WIDE, endurance_ms=7)
 

@@ -11,7 +11,7 @@ from planner.airspace import Airspace, OccupancyRule
 from planner.cfa_star import Planner, PlanRequest
 from planner.errors import NoPlan
 from planner.path import Plan
-from planner.together import Schedule, Together, _worth
+from planner.together import Interrupted, Schedule, Together, _worth
 from tests.benchmark import workloads
 from tests.planner.drawing import Drawing, drawn
 from tests.planner.traffic import EITHER_RULE, airspaces, flight, holds_in, planner_in, requests_in, reservations_in
@@ -207,6 +207,35 @@ def test_told_to_stop_it_has_what_it_had_and_an_interrupted_order_does_not_count
     together.improve(lambda: next(asked) > 30)
     assert together.iterations == 0
     assert together.best.plans == together.first_come.plans
+
+
+def test_told_to_stop_before_each_flight_was_planned_once_there_is_nothing() -> None:
+    lane = a_lane()
+    requests = [flight(lane["a"], lane["b"], latest=5000)] * 3
+    asked = iter([False, False, True])
+    with pytest.raises(Interrupted, match="3 flights"):
+        Together(planner_in(lane.airspace), requests, should_stop=asked.__next__)
+
+
+def test_it_can_be_stopped_before_it_knows_what_each_flight_would_get_alone() -> None:
+    lane = a_lane()
+    requests = [flight(lane["a"], lane["b"], earliest=at, latest=at) for at in (0, 5000, 10_000)]
+    together = Together(planner_in(lane.airspace), requests)
+    asked = iter([False, False, False, True, True])
+    together.improve(asked.__next__)
+    assert not together.is_best_possible
+    together.improve(never)
+    assert together.is_best_possible
+
+
+def test_nobody_who_is_refused_has_a_later_departure_looked_for() -> None:
+    class WithoutOutlook(Planner):
+        def _earliest_feasible_departure(self, *_: object) -> int | None:
+            raise AssertionError("nobody reads it")
+
+    lane = a_lane()
+    together = Together(WithoutOutlook(lane.airspace), [flight(lane["a"], lane["b"])] * 2)
+    assert together.first_come.figures.refused == 1
 
 
 def test_a_batch_of_nobody_is_the_best_possible() -> None:
