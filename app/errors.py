@@ -6,6 +6,7 @@ RequestError                 answered as a problem; `app.problems` maps every on
 ├── BeyondHorizon            departure later than plans are made
 ├── UnknownFlightIntent      no intent of that id
 ├── ItemRefused              an item of a batch, for which the whole batch is refused
+│   └── ItemNotAllowed       for its sender may not ask for it
 ├── BatchNotPlanned          a batch for which there was not enough time
 ├── UnknownBlock             no block of those indices
 ├── UnknownConstraint        no constraint of that id
@@ -87,6 +88,10 @@ class ItemRefused(RequestError):
         super().__init__(f"flight_intents[{index}]: {cause}")
         self.index = index
         self.cause = cause
+
+
+class ItemNotAllowed(ItemRefused):
+    """The sender of a batch may not ask for one of its items."""
 
 
 class BatchNotPlanned(RequestError):

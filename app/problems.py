@@ -88,6 +88,10 @@ KINDS: dict[type[Exception], Kind] = {
         "item-refused", 422, "An item of the batch is refused, and the batch with it",
         "Nothing was recorded. `cause` says what is wrong with the item at `index`; correct or leave it out.",
     ),
+    errors.ItemNotAllowed: Kind(
+        "item-not-allowed", 403, "An item of the batch is not allowed, and so the batch is refused",
+        "Nothing was recorded. `cause` says what the token does not allow in the item at `index`.",
+    ),
     errors.BatchNotPlanned: Kind(
         "batch-not-planned", 503, "There was not enough time to plan the batch",
         "Nothing was recorded. Send fewer flight intents at once, or the same later.",
@@ -274,7 +278,6 @@ def response(
 
 def response_to(error: Exception) -> Response:
     """Return the response to a domain error."""
-    kind = kind_of(error)
     members: dict[str, Any] = {}
     if isinstance(error, NotPlannable):
         members["reason"] = error.reason
@@ -292,8 +295,7 @@ def response_to(error: Exception) -> Response:
         members["needed_scopes"] = error.needed
     if isinstance(error, errors.ItemRefused):
         members |= {"index": error.index, "cause": orjson.Fragment(response_to(error.cause).body)}
-        kind = replace(kind, status=kind_of(error.cause).status)
-    return response(kind, str(error), members, _headers(error))
+    return response(kind_of(error), str(error), members, _headers(error))
 
 
 def _headers(error: Exception) -> dict[str, str]:

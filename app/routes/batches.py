@@ -16,7 +16,14 @@ from app import problems
 from app.auth import CallerDep
 from app.batches import BatchKey, BatchOutcome
 from app.deconfliction import Outcome
-from app.errors import ItemRefused, MalformedRequest, OperatorMismatch, PriorityNotAllowed, UnknownAircraftType
+from app.errors import (
+    ItemNotAllowed,
+    ItemRefused,
+    MalformedRequest,
+    OperatorMismatch,
+    PriorityNotAllowed,
+    UnknownAircraftType,
+)
 from app.routes.answers import ChangedFlightIntentAnswer, outcome_body
 from app.routes.submissions import Finite, FlightIntentBody, PositionBody, located, spoken_for
 from app.service import Service, ServiceDep
@@ -210,8 +217,10 @@ def _item(number: int) -> Iterator[None]:
     """Say of which item it is that something is wrong."""
     try:
         yield
-    except (UnknownAircraftType, NotPlannable, OperatorMismatch, PriorityNotAllowed) as error:
+    except (UnknownAircraftType, NotPlannable) as error:
         raise ItemRefused(number, error) from error
+    except (OperatorMismatch, PriorityNotAllowed) as error:
+        raise ItemNotAllowed(number, error) from error
     except RequestValidationError as error:
         place = ("body", "flight_intents", number)
         found = [{**item, "loc": (*place, *item["loc"][1:])} for item in error.errors()]

@@ -336,7 +336,7 @@ def test_an_item_of_a_batch_that_the_token_does_not_allow_is_named(
     api: Client, members: dict[str, Any], cause: str
 ) -> None:
     items = [intent(**{"priority": 0, **members, "operator": "acme-air"}), intent(**members)]
-    answer = problem(api.post(f"{SUBMIT}/batch", json={"flight_intents": items}, **as_()), 403, "item-refused")
+    answer = problem(api.post(f"{SUBMIT}/batch", json={"flight_intents": items}, **as_()), 403, "item-not-allowed")
     assert answer["cause"]["type"] == f"/problems/{cause}"
     assert answer["index"] == (1 if "operator" in members else 0)
 
