@@ -215,9 +215,9 @@ class Planner:
     def _search(self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex) -> Plan | NoPlan:
         """Search and return the plan, or the error that says why there is none."""
         in_air, spent = self._longest_in_air(bounds), 0
-        asked = request
+        asked, soonest = request, 0
         for _ in range(_LATER_DEPARTURES):
-            found = self._attempt(asked, motion, bounds, index)
+            found = self._attempt(asked, motion, bounds, index, soonest)
             if isinstance(found, NoPlan):
                 found.expansions += spent
                 return found
@@ -229,6 +229,7 @@ class Planner:
                 )
             spent += found.expansions
             # Nobody arrives earlier than that; so who is in the air for no longer departs no earlier than this.
+            soonest = int(found.arrive_ms[-1])
             earliest = found.arrival_ms - in_air
             if earliest > request.latest_departure_ms or self.search is Search.GREEDY:
                 break
@@ -239,8 +240,13 @@ class Planner:
             expansions=spent,
         )
 
-    def _attempt(self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex) -> Plan | NoPlan:
-        """Search once, for the earliest arrival within the aircraft's endurance; return as `_search` does."""
+    def _attempt(
+        self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex, soonest: int
+    ) -> Plan | NoPlan:
+        """Search once, for the earliest arrival within the aircraft's endurance; return as `_search` does.
+
+        Nobody gets to the last block's centre before `soonest`.
+        """
         in_air = self._longest_in_air(bounds)
         task = Task(
             request.origin,
@@ -251,6 +257,7 @@ class Planner:
             self.airspace.terminal_dwell_ms,
             self.hover_limit_ms,
             min(request.latest_departure_ms + in_air - self.airspace.terminal_dwell_ms, FAR_FUTURE),
+            soonest,
             stamp=0,
         )
         if self.search is Search.GREEDY:
@@ -343,10 +350,11 @@ class Planner:
             self._workspace = larger_workspace(self._workspace)
 
     def _next_stamp(self) -> int:
-        if self._stamp == LAST_STAMP:
+        """Return a stamp for a search, which has the one before it too."""
+        if self._stamp + 2 > LAST_STAMP:
             self._workspace.marks[:] = 0
             self._stamp = 0
-        self._stamp += 1
+        self._stamp += 2
         return self._stamp
 
     def _next_static_stamp(self) -> int:

@@ -32,7 +32,7 @@ class Task(NamedTuple):
     """One request: blocks, departure window, terminal dwell, the greedy search's hover limit, in ms; its stamp.
 
     `climb_out` is the dwell before the first link: none for a flight that is in the air already. Nothing that gets to
-    the destination after `until` is looked for.
+    the destination after `until` is looked for, and nothing gets there before `soonest`.
     """
 
     origin: int
@@ -43,6 +43,7 @@ class Task(NamedTuple):
     dwell: int
     hover_limit: int
     until: int
+    soonest: int
     stamp: int
 
 

@@ -26,6 +26,7 @@ from planner.kernels.labels import (
     gap_bounds,
     label_for,
 )
+from planner.kernels.landing import earliest_landing
 from planner.kernels.motion import (
     LEAD,
     OFFSET,
@@ -82,23 +83,6 @@ def open_label(heap: IntArray, size: int, labels: IntArray, label: int, f: int, 
 
 
 @kernel
-def earliest_landing(links: IntArray, table: Int32Array, pool: IntArray, task: Task, soonest: int) -> int:
-    """Return a bound of the arrival at the last block: from the gap on that an arrival at `soonest` could use."""
-    entering = FAR_FUTURE
-    for link in range(26):
-        entering = min(entering, links[link, TIME] - links[link, LEAD])
-    gap = ended_by(table, pool, task.destination, soonest)
-    # Behind a closure without an end there is no landing any more.
-    while soonest < FAR_FUTURE:
-        start, end = gap_bounds(table, pool, task.destination, gap, task.earliest)
-        soonest = max(soonest, start + entering)
-        if soonest + task.dwell + 1 <= end:
-            break
-        gap += 1
-    return soonest
-
-
-@kernel
 def undominated_start(
     links: IntArray,
     table: Int32Array,
@@ -152,7 +136,7 @@ def safe_interval(
         return NO_DEPARTURE_SLOT, -1, 0
     if count == labels.shape[0]:
         return WORKSPACE_FULL, -1, 0
-    landing = earliest_landing(links, table, pool, task, labels[0, G] + h)
+    landing = max(task.soonest, earliest_landing(open_links, motion, slabs, ws, task, bounds, labels[0, G]))
     if landing > min(task.until, FAR_FUTURE - 1):
         return NO_PATH, count, 0
     size = 0

@@ -119,6 +119,34 @@ def test_a_destination_reserved_for_an_hour_costs_a_few_expansions_not_the_whole
     assert waiting.expansions <= 3 * free.expansions
 
 
+def test_a_destination_in_a_closed_volume_costs_its_surroundings_not_the_whole_district() -> None:
+    airspace = district()
+    i, j, k = (axis.ravel() for axis in np.meshgrid(*map(np.arange, airspace.grid.dimensions), indexing="ij"))
+    closed = [(i, j, k) for i, j, k in zip(i, j, k, strict=True) if max(abs(i - 15), abs(j - SIDE // 2)) <= 8]
+    request = flight(SIDE * (SIDE // 2 + 1) - 1, airspace.grid.index((15, SIDE // 2, 0)), times=TIMES)
+    waiting = planner_in(airspace, [Hold(airspace.grid.index(block), 0, HOUR_MS) for block in closed]).plan(request)
+    assert waiting.arrival_ms >= HOUR_MS
+    assert waiting.expansions <= 100
+
+
+def test_to_look_again_for_a_later_departure_costs_little_more() -> None:
+    """All around the destination is reserved for a minute once that is free; somebody else comes to the origin."""
+    airspace = district()
+    grid = airspace.grid
+    destination = grid.index((SIDE - 1, SIDE - 1, 1))
+    around = [(-1, 0, 1), (0, -1, 1), (0, 0, 0), (-1, 0, 0), (0, -1, 0), (-1, -1, 1), (-1, -1, 0)]
+    shut = [Hold(grid.index((SIDE - 1 + i, SIDE - 1 + j, k)), HOUR_MS, HOUR_MS + 60_000) for i, j, k in around]
+    origin = grid.index((SIDE - 1, 0, 0))
+    planner = planner_in(airspace, [Hold(destination, 0, HOUR_MS), *shut, Hold(origin, 10_000, HOUR_MS - 20_000)])
+    request = flight(origin, destination, latest=HOUR_MS, times=TIMES)
+    first = planner.plan(request)
+    planner.detour_limit_ms = 60_000
+    later = planner.plan(request)
+    assert later.departure_ms > first.departure_ms
+    assert later.arrival_ms == first.arrival_ms > HOUR_MS + 60_000
+    assert first.expansions < later.expansions <= first.expansions + 100
+
+
 def test_proof_that_there_is_no_path_is_as_short_as_what_shuts_the_flight_in() -> None:
     """All around the origin is reserved until its own free interval is over."""
     airspace = district()

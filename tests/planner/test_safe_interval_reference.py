@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planner.airspace import Airspace, OccupancyRule
+from planner.airspace import Airspace, BoolArray, OccupancyRule
 from planner.cfa_star import PlanRequest
 from planner.errors import NoPlan, NotPlannable
 from tests.planner.drawing import airspace_of
@@ -69,7 +69,23 @@ def rushes(draw: st.DrawFn) -> Rush:
     for block in np.flatnonzero(closed & ~occupied).tolist():
         enter = int(random.integers(60))
         closures.append(Hold(block, enter, enter + int(random.integers(1, 40))))
+    if draw(st.booleans()):
+        closures = _volume(dimensions, occupied, random)
     return Rush(airspace, tuple(closures), tuple(requests))
+
+
+def _volume(dimensions: tuple[int, int, int], occupied: BoolArray, random: np.random.Generator) -> list[Hold]:
+    """Return what closes all blocks of a box, with a ragged end."""
+    inside = np.ones(dimensions[::-1], dtype=np.bool_)
+    for axis, count in enumerate(inside.shape):
+        low, high = np.sort(random.integers(count + 1, size=2))
+        outside = (np.arange(count) < low) | (np.arange(count) >= high)
+        np.moveaxis(inside, axis, 0)[outside] = False
+    enter, until = int(random.integers(20)), int(random.integers(40, 150))
+    return [
+        Hold(block, enter, until + int(random.integers(8)))
+        for block in np.flatnonzero(inside.ravel() & ~occupied).tolist()
+    ]
 
 
 def arrival_by(planner: SafeIntervalPlanner, request: PlanRequest) -> int | None:
