@@ -23,7 +23,7 @@ from app.errors import (
     UnknownFlightIntent,
 )
 from app.flight_intents import OPEN_STATES, Displacement, FlightIntent, Refusal, Reservations, State, Submission
-from app.ledger import Ledger, Transaction
+from app.ledger import Ledger, Rewriting, Transaction
 from app.scheduling import Cause, Scheduler, details_of, refusal, reservations
 from app.surveillance import Aircraft, Sighting
 from app.times import format_time
@@ -385,7 +385,7 @@ class Deconfliction:
         )
         with transaction.one_revision():
             vacated = scheduler.vacate(transaction, now, [before.sequence, *scheduler.in_the_way(plan, before)])
-            after = transaction.rewrite(before, after, now, details_of(before, after))
+            [after] = transaction.rewrite([Rewriting(before, after, details_of(before, after))], now)
             scheduler.reserve(after, now)
             others = [intent for intent in vacated if intent.sequence != before.sequence]
             return Outcome(after, scheduler.settle(transaction, now, others, Cause(flight_intent_id=after.id)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from app.errors import BeyondHorizon, DepartureInThePast, IllegalTransition, NotChangeable
 from app.flight_intents import Displacement, FlightIntent, Refusal, Reservations, State, Submission
-from app.ledger import Transaction
+from app.ledger import Rewriting, Transaction
 from app.submitted_paths import path_refusal
 from app.times import format_time
 from planner.airmatrix import IntArray
@@ -196,7 +196,7 @@ class Scheduler:
         They depart after their operators have had notice. The write lock is held meanwhile: beyond an amount of work,
         those that are left are displaced, and can be changed one by one.
         """
-        displaced, spent = [], 0
+        changes, displaced, spent = [], [], 0
         for intent in sorted(vacated, key=lambda intent: (-intent.submission.priority, intent.sequence)):
             reason: str | None = None
             try:
@@ -212,10 +212,11 @@ class Scheduler:
             else:
                 spent += plan.expansions
                 after = replace(intent, trajectory=plan, reservations=reservations(plan))
-            transaction.rewrite(intent, after, now, details_of(intent, after, cause, reason))
             self.reserve(after, now)
+            changes.append(Rewriting(intent, after, details_of(intent, after, cause, reason)))
             operator, moved = intent.submission.operator, moved_ms(intent, after)
             displaced.append(Displacement(intent.sequence, intent.id, operator, after.state, *moved, reason))
+        transaction.rewrite(changes, now)
         return tuple(displaced)
 
     def reserve(self, intent: FlightIntent, now: int) -> None:

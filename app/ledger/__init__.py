@@ -4,7 +4,7 @@ from app.ledger.engine import check_exists, create_or_upgrade, open_ledger
 from app.ledger.ledger import CommitUncertain, Ledger
 from app.ledger.location import Location, parse_location
 from app.ledger.queries import IdempotencyRecord, JournalEntry
-from app.ledger.transaction import ConstraintViolated, Transaction
+from app.ledger.transaction import ConstraintViolated, Rewriting, Transaction
 
 __all__ = [
     "CommitUncertain",
@@ -13,6 +13,7 @@ __all__ = [
     "JournalEntry",
     "Ledger",
     "Location",
+    "Rewriting",
     "Transaction",
     "check_exists",
     "create_or_upgrade",

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import takewhile
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, tuple_, update
@@ -30,6 +30,8 @@ from planner.airmatrix import IntArray
 from planner.airspace import Airspace
 from planner.path import Trajectory
 
+# The name for the sequence number in an update, where a column's own name is not free.
+_REWRITTEN = "rewritten"
 # In a connection's notes.
 _SEEN = "airmatrix has seen this database"
 
@@ -38,6 +40,14 @@ InsertReservations = Callable[[Connection, HeldReservations], None]
 
 class ConstraintViolated(Exception):
     """The database refused rows, such as an overlapping reservation: the caller's picture of the ledger was wrong."""
+
+
+class Rewriting(NamedTuple):
+    """An intent before and after it was planned again, and the details for its journal entry."""
+
+    before: FlightIntent
+    after: FlightIntent
+    details: Mapping[str, object]
 
 
 @contextmanager
@@ -192,36 +202,39 @@ class Transaction:
             self._connection.execute(delete(reservations).where(reservations.c.intent.in_(part)))
 
     @_asking()
-    def rewrite(
-        self, before: FlightIntent, after: FlightIntent, now_ms: int, details: Mapping[str, object]
-    ) -> FlightIntent:
-        """Replace a vacated intent by what it is now, under its old sequence number and a new version, and return that.
+    def rewrite(self, changes: Sequence[Rewriting], now_ms: int) -> list[FlightIntent]:
+        """Replace vacated intents by what they are now under their old sequence numbers; return them with new versions.
 
         Raises
         ------
         ConstraintViolated
         """
+        if not changes:
+            return []
         self.flush()
-        submission, trajectory = after.submission, after.trajectory
-        counters = self._counters
-        self._counters = replace(
-            counters,
-            longest_flight=max(counters.longest_flight, 0 if trajectory is None else trajectory.flight_time_ms),
-            lowest_priority=min(counters.lowest_priority, submission.priority),
-        )
-        released = before.reservations.beyond(now_ms)
-        revision = self._append(before.sequence, before.id, now_ms, after.state, released, details=details)
-        intent = replace(after, version=revision)
-        row = to_row(intent)
-        try:
-            self._connection.execute(
-                update(flight_intents).where(flight_intents.c.sequence == row.pop("sequence")).values(row)
+        rewritten = []
+        for before, after, details in changes:
+            counters, arrives = self._counters, after.trajectory
+            self._counters = replace(
+                counters,
+                longest_flight=max(counters.longest_flight, 0 if arrives is None else arrives.flight_time_ms),
+                lowest_priority=min(counters.lowest_priority, after.submission.priority),
             )
-            if len(intent.reservations):
-                self._insert_reservations(self._connection, joined([intent]))
+            released = before.reservations.beyond(now_ms)
+            revision = self._append(before.sequence, before.id, now_ms, after.state, released, details=details)
+            rewritten.append(replace(after, version=revision))
+        rows = [to_row(intent) for intent in rewritten]
+        for row in rows:
+            row[_REWRITTEN] = row.pop("sequence")
+        try:
+            columns: dict[str, Any] = {name: bindparam(name) for name in rows[0] if name != _REWRITTEN}
+            is_rewritten = flight_intents.c.sequence == bindparam(_REWRITTEN)
+            self._connection.execute(update(flight_intents).where(is_rewritten).values(columns), rows)
+            if any(len(intent.reservations) for intent in rewritten):
+                self._insert_reservations(self._connection, joined(rewritten))
         except IntegrityError as error:
             raise ConstraintViolated(cause_of(error)) from error
-        return intent
+        return rewritten
 
     @_asking()
     def movable(self, priority_below: int | None, departs_from_ms: int) -> IntArray:
@@ -481,7 +494,7 @@ class Transaction:
 
     def flush(self) -> None:
         """Write the rows that wait, and how far the counters have come; raises `ConstraintViolated`."""
-        if self._counters == self._written and not self._new_entries:
+        if self._counters == self._written and not self._new_entries and not self._new_keys:
             return
         began = time.perf_counter()
         intents = list(self._new_intents.values())
