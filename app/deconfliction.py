@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 import structlog
 from uuid_utils import uuid7
 
-from app.constraints import Constraint
+from app.airspace_closing import Closed
 from app.errors import (
     IdempotencyKeyReused,
     IllegalTransition,
     NotChangeable,
     PreconditionFailed,
     TooManyOpenIntents,
-    UnknownConstraint,
     UnknownFlightIntent,
 )
 from app.flight_intents import OPEN_STATES, Displacement, FlightIntent, Refusal, Reservations, State, Submission
@@ -88,15 +87,6 @@ class PreviewPlan:
     trajectory: Trajectory
     reservations: Reservations
     displaces: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Closed:
-    """A constraint, the flights that had to make way for it, and the ids of those that no longer could."""
-
-    constraint: Constraint
-    displaced: tuple[Displacement, ...] = ()
-    unmoved: tuple[str, ...] = ()
 
 
 class Deconfliction:
@@ -196,49 +186,6 @@ class Deconfliction:
             return outcome
 
         return await self._writer.perform(run, look_up, plans=True)
-
-    async def close(self, constraint: Constraint) -> Closed:
-        """Record a constraint, and plan those anew whom it hits and who can still make way.
-
-        Raises
-        ------
-        TooManyConstraints, QueueFull, LedgerUnavailable, OutcomeUnknown
-        """
-
-        # What the last attempt did, which is what was done if the constraint is in the ledger.
-        done: list[Closed] = []
-
-        def run(transaction: Transaction, now: int) -> Closed:
-            done[:] = [self._close(transaction, now, constraint)]
-            return done[0]
-
-        def look_up() -> Closed | None:
-            return done[0] if done and self._ledger.constraint(constraint.id) is not None else None
-
-        return await self._writer.perform(run, look_up)
-
-    async def reopen(self, constraint_id: str) -> Constraint:
-        """Remove a constraint. Who made way for it stays where it is now.
-
-        Raises
-        ------
-        UnknownConstraint, QueueFull, LedgerUnavailable, OutcomeUnknown
-        """
-
-        def run(transaction: Transaction, now: int) -> Constraint:
-            constraint = transaction.constraint(constraint_id)
-            if constraint is None:
-                raise UnknownConstraint(f"there is no constraint {constraint_id}")
-            if constraint.removed_ms is None:
-                constraint = transaction.remove_constraint(constraint, now)
-                self._scheduler.index.reopen([constraint.number])
-            return constraint
-
-        def look_up() -> Constraint | None:
-            constraint = self._ledger.constraint(constraint_id)
-            return constraint if constraint is not None and constraint.removed_ms is not None else None
-
-        return await self._writer.perform(run, look_up)
 
     async def cancel(self, intent_id: str) -> FlightIntent:
         """Cancel an intent that is accepted or displaced. Before departure its reservations go, after it they stay
@@ -409,17 +356,6 @@ class Deconfliction:
                 "activated and conforms, or reported on the ground"
             )
         return False
-
-    def _close(self, transaction: Transaction, now: int, constraint: Constraint) -> Closed:
-        scheduler = self._scheduler
-        with transaction.one_revision():
-            recorded = transaction.record_constraint(constraint, now)
-            hit = scheduler.within(transaction, now, recorded.closure)
-            vacated = scheduler.vacate(transaction, now, hit.movable)
-            scheduler.index.close({recorded.number: recorded.closure})
-            displaced = scheduler.settle(transaction, now, vacated, Cause(constraint_id=recorded.id))
-        ids = transaction.ids(hit.unmovable)
-        return Closed(recorded, displaced, tuple(ids[sequence] for sequence in hit.unmovable))
 
     def _cancel(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
         intent = _found(transaction, intent_id)

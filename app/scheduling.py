@@ -5,8 +5,11 @@ airspace moves whom it hits. Who has to make way is planned again in the same tr
 sequence, around everything and displacing nobody. All of it runs in the writer's thread.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,14 +22,15 @@ from planner.airmatrix import IntArray
 from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import NoPlan
 from planner.holds import holds_of
+from planner.kernels.intervals import FAR_FUTURE
 from planner.occupancy import Closure, OccupancyIndex
 from planner.path import Plan
 from planner.submitted import PathConflicts, SubmittedPath, conflicts
 
 # A departure window may have opened before the intent came, but not longer ago than this.
 _OPEN_FOR_MS = 86_400_000
-# Up to so many flights that make way are each worth a second search.
-_FEW = 16
+# Up to so many flights that make way are each worth a second search, and planned while the writer waits.
+FEW = 16
 
 
 class AircraftTypeGone(NoPlan):
@@ -73,6 +77,22 @@ class Cause:
         return {"constraint_id": str(self.constraint_id)}
 
 
+@dataclass(frozen=True, eq=False)
+class Foreseen:
+    """What planning a flight again has given before it had to make way, while it had this version."""
+
+    version: int
+    outcome: Plan | NoPlan
+
+    def renumbered(self, old: int, new: int) -> "Foreseen":
+        """Return it with another number for a constraint that is in the way."""
+        if isinstance(self.outcome, Plan):
+            return self
+        told = copy(self.outcome)
+        told.conflicting_owners = tuple(-new if owner == -old else owner for owner in told.conflicting_owners)
+        return replace(self, outcome=told)
+
+
 class Scheduler:
     """Plans flights, and moves those that have to make way. Changes the planner's index as it changes the ledger."""
 
@@ -95,10 +115,20 @@ class Scheduler:
         DepartureInThePast, BeyondHorizon, NoPlan
         """
         self.check_window(submission, now)
-        index = self._unyielding(transaction, now, submission, own)
-        if submission.path is not None:
-            return self._as_submitted(submission, submission.path, now, index, own)
-        return self.planner.plan(self.request(submission, now), index)
+        with self._freed(own, now):
+            if submission.path is not None:
+                index = self._unyielding(transaction, now, submission)
+                return self._as_submitted(submission, submission.path, now, index, own)
+            request = self.request(submission, now)
+            if submission.priority <= transaction.lowest_priority:
+                return self.planner.plan(request)
+            until_ms = self.planner.ends_by(request)
+            try:
+                index = self._unyielding(transaction, now, submission, request.earliest_departure_ms, until_ms)
+                return self.planner.plan(request, index, outlook=False)
+            except NoPlan:
+                # When else it could fly depends on what is reserved later.
+                return self.planner.plan(request, self._unyielding(transaction, now, submission))
 
     def _as_submitted(
         self,
@@ -142,19 +172,20 @@ class Scheduler:
         if not all(map(np.array_equal, needed, _columns(own.reservations))):
             raise NotChangeable("the flight is in the air and flies in volumes: nobody knows where it will be")
         from_ms = max(now + self._limits.lead_ms, path.departure_ms + path.terminal_dwell_ms)
-        index = self._unyielding(transaction, now, submission, own)
-        for place in range(int(np.searchsorted(path.depart_ms, from_ms)), len(path.block) - 1):
-            block, start_ms = int(path.block[place]), max(int(path.arrive_ms[place]), from_ms)
-            if block != submission.destination_block and not index.owners(block, start_ms, start_ms + 1):
-                flown = replace(
-                    path,
-                    block=path.block[: place + 1],
-                    arrive_ms=path.arrive_ms[: place + 1],
-                    depart_ms=path.depart_ms[: place + 1],
-                )
-                performance = self._performances[submission.aircraft_type]
-                request = PlanRequest(block, submission.destination_block, performance, start_ms, start_ms)
-                return self.planner.continued(flown, request, index)
+        with self._freed(own, now):
+            index = self._unyielding(transaction, now, submission)
+            for place in range(int(np.searchsorted(path.depart_ms, from_ms)), len(path.block) - 1):
+                block, start_ms = int(path.block[place]), max(int(path.arrive_ms[place]), from_ms)
+                if block != submission.destination_block and not index.owners(block, start_ms, start_ms + 1):
+                    flown = replace(
+                        path,
+                        block=path.block[: place + 1],
+                        arrive_ms=path.arrive_ms[: place + 1],
+                        depart_ms=path.depart_ms[: place + 1],
+                    )
+                    performance = self._performances[submission.aircraft_type]
+                    request = PlanRequest(block, submission.destination_block, performance, start_ms, start_ms)
+                    return self.planner.continued(flown, request, index)
         raise IllegalTransition(
             f"flight intent {own.id} is about to land, or leaves closed airspace only where it lands: "
             "it can no longer be planned anew"
@@ -171,7 +202,7 @@ class Scheduler:
         owners = self.index.owners_within(
             closure.block[to_come], np.maximum(closure.enter_ms, now)[to_come], closure.exit_ms[to_come]
         )
-        movable = set(self._movable(transaction, now, None).tolist())
+        movable = set(transaction.movable(None, now + self._limits.notice_ms).tolist())
         flights = [owner for owner in owners if owner > 0]
         return Hit(
             tuple(owner for owner in flights if owner in movable),
@@ -188,36 +219,82 @@ class Scheduler:
             self.index.release(*_columns(intent.reservations.beyond(now)))
         return intents
 
+    def foresee(
+        self, intents: Sequence[FlightIntent], index: OccupancyIndex, now: int, should_stop: Callable[[], bool]
+    ) -> dict[int, Foreseen]:
+        """Plan flights, by sequence number, as `settle` would, with an index of the caller's and another planner.
+
+        It `should_stop` before one or another: the rest is left out. Safe in any thread.
+        """
+        planner = Planner(
+            self.planner.airspace, self.planner.search, self.planner.hover_limit_ms, self.planner.detour_limit_ms
+        )
+        foreseen: dict[int, Foreseen] = {}
+        for intent in _in_turn(intents):
+            if should_stop():
+                break
+            outcome = self._again(planner, index, intent, now, outlook=False)
+            if isinstance(outcome, Plan):
+                index.reserve(outcome.hold_block, outcome.hold_enter_ms, outcome.hold_exit_ms, intent.sequence)
+            foreseen[intent.sequence] = Foreseen(intent.version, outcome)
+        return foreseen
+
     def settle(
-        self, transaction: Transaction, now: int, vacated: Sequence[FlightIntent], cause: Cause
+        self,
+        transaction: Transaction,
+        now: int,
+        vacated: Sequence[FlightIntent],
+        cause: Cause,
+        foreseen: Mapping[int, Foreseen] = MappingProxyType({}),
     ) -> tuple[Displacement, ...]:
         """Plan vacated flights again, by priority and then by sequence; who finds no place is displaced.
 
-        They depart after their operators have had notice. The write lock is held meanwhile: beyond an amount of work,
-        those that are left are displaced, and can be changed one by one.
+        They depart after their operators have had notice. What was `foreseen` is so, if it still holds. The write lock
+        is held meanwhile: beyond an amount of work, those that are left are displaced, and can be changed one by one.
         """
         changes, displaced, spent = [], [], 0
-        for intent in sorted(vacated, key=lambda intent: (-intent.submission.priority, intent.sequence)):
-            reason: str | None = None
-            try:
-                if spent > self._limits.most_expansions:
-                    raise TooManyAtOnce("too many flights had to make way at once to plan all of them again")
+        for intent in _in_turn(vacated):
+            outcome = self._as_foreseen(foreseen.get(intent.sequence), intent, now)
+            if outcome is None and spent > self._limits.most_expansions:
+                outcome = TooManyAtOnce("too many flights had to make way at once to plan all of them again")
+            elif outcome is None:
                 # Where many have to make way, nobody looks for when else those could fly who find no place.
-                request = self.request(intent.submission, now + self._limits.notice_ms)
-                plan = self.planner.plan(request, outlook=len(vacated) <= _FEW)
-            except NoPlan as error:
-                spent += error.expansions
-                after = self._displaced(transaction, intent, error, cause)
-                reason = error.reason
+                outcome = self._again(self.planner, self.index, intent, now, outlook=len(vacated) <= FEW)
+                spent += outcome.expansions
+            if isinstance(outcome, NoPlan):
+                reason: str | None = outcome.reason
+                after = self._displaced(transaction, intent, outcome, cause)
             else:
-                spent += plan.expansions
-                after = replace(intent, trajectory=plan, reservations=reservations(plan))
+                reason = None
+                after = replace(intent, trajectory=outcome, reservations=reservations(outcome))
             self.reserve(after, now)
             changes.append(Rewriting(intent, after, details_of(intent, after, cause, reason)))
             operator, moved = intent.submission.operator, moved_ms(intent, after)
             displaced.append(Displacement(intent.sequence, intent.id, operator, after.state, *moved, reason))
         transaction.rewrite(changes, now)
         return tuple(displaced)
+
+    def _again(
+        self, planner: Planner, index: OccupancyIndex, intent: FlightIntent, now: int, *, outlook: bool
+    ) -> Plan | NoPlan:
+        """Plan a flight that has to make way, with notice for its operator."""
+        try:
+            request = self.request(intent.submission, now + self._limits.notice_ms)
+            return planner.plan(request, index, outlook=outlook)
+        except NoPlan as error:
+            return error
+
+    def _as_foreseen(self, known: Foreseen | None, intent: FlightIntent, now: int) -> Plan | NoPlan | None:
+        """Return what was foreseen of a flight, None where that is nothing or does not hold any more."""
+        if known is None or known.version != intent.version:
+            return None
+        plan = known.outcome
+        if isinstance(plan, Plan) and (
+            plan.departure_ms < now + self._limits.notice_ms
+            or self.index.owners_within(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
+        ):
+            return None
+        return plan
 
     def reserve(self, intent: FlightIntent, now: int) -> None:
         """Bring what an intent still holds into the index."""
@@ -234,17 +311,30 @@ class Scheduler:
             refusal=replace(told, detail=f"displaced by {cause}, and then: {told.detail}"),
         )
 
-    def _unyielding(
-        self, transaction: Transaction, now: int, submission: Submission, own: FlightIntent | None
-    ) -> OccupancyIndex:
-        """Return an index of what a submission has to be planned around."""
-        gone = [] if own is None else [own.sequence]
-        if submission.priority > transaction.lowest_priority:
-            gone += self._movable(transaction, now, submission.priority).tolist()
-        return self.index.without(np.array(gone, dtype=np.int64)) if gone else self.index
+    @contextmanager
+    def _freed(self, own: FlightIntent | None, now: int) -> Iterator[None]:
+        """Have an index without what a flight holds that is planned anew."""
+        held = Reservations.none() if own is None else own.reservations.beyond(now)
+        self.index.release(*_columns(held))
+        try:
+            yield
+        finally:
+            if own is not None:
+                self.index.reserve(*_columns(held), own.sequence)
 
-    def _movable(self, transaction: Transaction, now: int, priority_below: int | None) -> IntArray:
-        return transaction.movable(priority_below, now + self._limits.notice_ms)
+    def _unyielding(
+        self,
+        transaction: Transaction,
+        now: int,
+        submission: Submission,
+        from_ms: int = 0,
+        until_ms: int = FAR_FUTURE,
+    ) -> OccupancyIndex:
+        """Return an index of what a submission has to be planned around, as far as it overlaps [from, until)."""
+        if submission.priority <= transaction.lowest_priority:
+            return self.index
+        yielding = transaction.movable(submission.priority, now + self._limits.notice_ms, until_ms)
+        return self.index.without(yielding, from_ms, until_ms) if len(yielding) else self.index
 
     def request(self, submission: Submission, from_ms: int) -> PlanRequest:
         """Return what to ask of the planner for a departure at a time or later; raises `AircraftTypeGone`."""
@@ -292,6 +382,11 @@ class Hit:
 
     movable: tuple[int, ...]
     unmovable: tuple[int, ...]
+
+
+def _in_turn(intents: Sequence[FlightIntent]) -> list[FlightIntent]:
+    """Return flights in the order in which they are planned again."""
+    return sorted(intents, key=lambda intent: (-intent.submission.priority, intent.sequence))
 
 
 def reservations(plan: Plan) -> Reservations:

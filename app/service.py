@@ -14,6 +14,7 @@ import structlog
 from fastapi import Depends, Request
 
 from app import auth
+from app.airspace_closing import AirspaceClosing
 from app.batches import Batches
 from app.conformance import Thresholds
 from app.deconfliction import Deconfliction, log_intents
@@ -64,6 +65,7 @@ class Writing:
 
     writer: Writer
     deconfliction: Deconfliction
+    airspace_closing: AirspaceClosing
     batches: Batches
     telemetry: Telemetry
     webhooks: Webhooks
@@ -101,6 +103,11 @@ class Service:
     def deconfliction(self) -> Deconfliction:
         """What plans and records flights; raises `ReadOnlyServer` where nothing does."""
         return self._writing().deconfliction
+
+    @property
+    def airspace_closing(self) -> AirspaceClosing:
+        """What closes airspace and opens it again; raises `ReadOnlyServer` where nothing does."""
+        return self._writing().airspace_closing
 
     @property
     def batches(self) -> Batches:
@@ -299,8 +306,15 @@ def _writing(
     writer.start()
     deliverer.start()
     metrics.index_loaded(len(planner.index))
-    batches = Batches(writer, ledger, scheduler, deconfliction)
-    return Writing(writer, deconfliction, batches, telemetry, Webhooks(ledger, writer, destinations), deliverer)
+    return Writing(
+        writer,
+        deconfliction,
+        AirspaceClosing(writer, ledger, scheduler),
+        Batches(writer, ledger, scheduler, deconfliction),
+        telemetry,
+        Webhooks(ledger, writer, destinations),
+        deliverer,
+    )
 
 
 async def of_request(request: Request) -> Service:

@@ -153,6 +153,12 @@ class Planner:
         bounds = self._bounds(self._motion(request.performance), request.origin, request.destination)
         return int(bounds.optimum) + 2 * self.airspace.terminal_dwell_ms
 
+    def ends_by(self, request: PlanRequest) -> int:
+        """Return when every plan for a request is over, however much is reserved; FAR_FUTURE without a detour limit."""
+        if self.detour_limit_ms is None:
+            return FAR_FUTURE
+        return request.latest_departure_ms + self.unconstrained(request) + self.detour_limit_ms + 1
+
     def continued(self, flown: Trajectory, request: PlanRequest, index: OccupancyIndex | None = None) -> Plan:
         """Return the plan of a flight in the air: as it has `flown` until it reaches the origin of `request`, and from
         there as `plan` finds it.

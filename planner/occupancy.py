@@ -112,12 +112,21 @@ class OccupancyIndex:
         copied._closed_rows, copied._is_closed = self._closed_rows, self._is_closed
         return copied
 
-    def without(self, owners: IntArray) -> "OccupancyIndex":
-        """Return a copy without the reservations of one or more owners; closures reach where those were."""
-        copied, first_owner = self.copy(), int(owners.min())
+    def without(self, owners: IntArray, from_ms: int = 0, to_ms: int = intervals.FAR_FUTURE) -> "OccupancyIndex":
+        """Return a copy of what overlaps [from, to) without the reservations of one or more owners; closures, whenever
+        they are, reach where those were.
+        """
+        first_owner = int(owners.min())
         is_dropped = np.zeros(int(owners.max()) - first_owner + 1, dtype=np.bool_)
         is_dropped[owners - first_owner] = True
-        copied._size -= int(intervals.drop_owners(*copied.slabs, is_dropped, first_owner))
+        kept = (self.slabs.table, self.slabs.pool, is_dropped, first_owner, from_ms, to_ms)
+        copied = OccupancyIndex(len(self.slabs.table))
+        intervals.copy_kept(*kept, copied.slabs.table, np.empty((0, 3), dtype=np.int64))
+        copied.slabs = intervals.with_room(copied.slabs.table)
+        intervals.copy_kept(*kept, copied.slabs.table, copied.slabs.pool)
+        copied._size = int(copied.slabs.table[:, intervals.COUNT].sum())
+        copied._closures = dict(self._closures)
+        copied._closed_rows, copied._is_closed = self._closed_rows, self._is_closed
         copied._lay_closures(np.flatnonzero(self._is_closed))
         return copied
 

@@ -133,6 +133,11 @@ class Ledger:
         with self._reading() as connection:
             return queries.find(connection, self._airspace, intent_id)
 
+    def find_all(self, sequences: Iterable[int]) -> list[FlightIntent]:
+        """Return intents with their reservations, by sequence."""
+        with self._reading() as connection:
+            return queries.find_all(connection, self._airspace, sequences)
+
     def answer_to(self, operator: str, key: str) -> IdempotencyRecord | None:
         """Return the first answer to an idempotency key, None if it is new."""
         with self._reading() as connection:

@@ -28,6 +28,7 @@ from app.ledger.webhooks import WebhookRows
 from app.surveillance import Aircraft, Remark, Sighting
 from planner.airmatrix import IntArray
 from planner.airspace import Airspace
+from planner.kernels.intervals import FAR_FUTURE
 from planner.path import Trajectory
 
 # The name for the sequence number in an update, where a column's own name is not free.
@@ -237,13 +238,13 @@ class Transaction:
         return rewritten
 
     @_asking()
-    def movable(self, priority_below: int | None, departs_from_ms: int) -> IntArray:
-        """Return the sequence numbers of accepted flights that depart at a time or later and have not been activated;
+    def movable(self, priority_below: int | None, from_ms: int, until_ms: int = FAR_FUTURE) -> IntArray:
+        """Return the sequence numbers of accepted flights that depart within [from, until) and have not been activated;
         of a lower priority only, where one is given.
         """
         self.flush()
         flight = flight_intents.c
-        wanted = [flight.departure >= departs_from_ms, flight.activated.is_(None)]
+        wanted = [flight.departure >= from_ms, flight.departure < until_ms, flight.activated.is_(None)]
         if priority_below is not None:
             wanted.append(flight.priority < priority_below)
         query = select(flight.sequence).where(queries.ACCEPTED, *wanted)

@@ -134,7 +134,7 @@ async def close(service: ServiceDep, body: ConstraintBody) -> Response:
     polygon = body.polygon.model_dump()
     # A jagged polygon over a large airspace takes a while.
     blocks = await to_thread.run_sync(volume_blocks, service.airspace.grid, polygon, body.base_m, body.top_m)
-    closed = await service.deconfliction.close(
+    closed = await service.airspace_closing.close(
         Constraint(
             number=0,
             id=str(uuid7()),
@@ -216,7 +216,7 @@ def read(service: ServiceDep, constraint_id: str) -> Response:
 )
 async def reopen(service: ServiceDep, constraint_id: str) -> Response:
     """Remove a constraint. Flights that made way for it stay where they are planned now."""
-    constraint = await service.deconfliction.reopen(_id(constraint_id))
+    constraint = await service.airspace_closing.reopen(_id(constraint_id))
     return Response(orjson.dumps(render(constraint)), media_type="application/json")
 
 

@@ -49,6 +49,19 @@ def empty_slabs(block_count: int, pool_size: int) -> Slabs:
     return Slabs(table, np.empty((pool_size, 3), dtype=np.int64), chains)
 
 
+def with_room(table: Int32Array) -> Slabs:
+    """Return a table and an empty pool with a slab for as many reservations of each block as the table counts."""
+    slabs = -(-table[:, COUNT].astype(np.int64) // SMALLEST_SLAB)
+    size_class = np.ceil(np.log2(np.maximum(slabs, 1))).astype(np.int64)
+    slots = np.where(slabs > 0, SMALLEST_SLAB << size_class, 0)
+    end = np.cumsum(slots)
+    table[:, FIRST] = np.where(slabs > 0, end - slots, -1)
+    table[:, SIZE_CLASS] = np.where(slabs > 0, size_class, 0)
+    chains = empty_slabs(0, 0).chains
+    chains[SIZE_CLASSES] = end[-1]
+    return Slabs(table, np.empty((end[-1] + (1 << 12), 3), dtype=np.int64), chains)
+
+
 @kernel
 def ended_by(table: Int32Array, pool: IntArray, block: int, time: int) -> int:
     """Return how many of a block's reservations have ended by `time`: the gap or reservation that holds it.
@@ -217,25 +230,35 @@ def forget(table: Int32Array, pool: IntArray, chains: IntArray, time: int) -> in
 
 
 @kernel
-def drop_owners(table: Int32Array, pool: IntArray, chains: IntArray, is_dropped: BoolArray, first_owner: int) -> int:
-    """Drop every part of a closure, and every reservation of owners for whom `is_dropped` (owners,) says so, which
-    begins with `first_owner`; return how many were reservations.
+def copy_kept(
+    table: Int32Array,
+    pool: IntArray,
+    is_dropped: BoolArray,
+    first_owner: int,
+    from_ms: int,
+    to_ms: int,
+    kept_table: Int32Array,
+    kept_pool: IntArray,
+) -> None:
+    """Copy the reservations that overlap [from, to) to where `kept_table` has room for them, and count them there; not
+    those of owners for whom `is_dropped` (owners,) says so, which begins with `first_owner`, nor parts of closures.
+
+    With an empty `kept_pool` they are only counted.
     """
-    dropped = 0
     for block in range(table.shape[0]):
-        first, count = table[block, FIRST], table[block, COUNT]
-        kept = 0
-        for slot in range(first, first + count):
-            owner = pool[slot, OWNER]
-            place = owner - first_owner
-            if owner >= 0 and not (0 <= place < is_dropped.shape[0] and is_dropped[place]):
-                move(pool, slot, first + kept)
-                kept += 1
-            else:
-                dropped += owner >= 0
-        if kept < count:
-            drop_range(table, pool, chains, block, kept, count)
-    return dropped
+        first, count, kept = table[block, FIRST], table[block, COUNT], 0
+        for slot in range(first + ended_by(table, pool, block, from_ms), first + count):
+            if pool[slot, ENTER] >= to_ms:
+                break
+            place = pool[slot, OWNER] - first_owner
+            if pool[slot, OWNER] < 0 or (0 <= place < is_dropped.shape[0] and is_dropped[place]):
+                continue
+            if kept_pool.shape[0] > 0:
+                target = kept_table[block, FIRST] + kept
+                for column in range(3):
+                    kept_pool[target, column] = pool[slot, column]
+            kept += 1
+        kept_table[block, COUNT] = kept
 
 
 @kernel

@@ -1,11 +1,23 @@
-"""Fixtures: two processes on one ledger."""
+"""Fixtures: processes on a ledger, one or two."""
 
 from collections.abc import Iterator
 
 import pytest
 
-from tests.ledger.district import STREET
+from tests.ledger.district import SQUARE, STREET
 from tests.ledger.process import FakeClock, Process
+
+
+@pytest.fixture
+def street(ledger: str, clock: FakeClock) -> Iterator[Process]:
+    with Process(ledger, STREET.airspace, clock) as process:
+        yield process
+
+
+@pytest.fixture
+def square(ledger: str, clock: FakeClock) -> Iterator[Process]:
+    with Process(ledger, SQUARE.airspace, clock) as process:
+        yield process
 
 
 @pytest.fixture

@@ -9,11 +9,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from app.airspace_closing import AirspaceClosing
 from app.deconfliction import Deconfliction, IdempotencyKey, Outcome
-from app.flight_intents import FlightIntent, Submission
+from app.flight_intents import FlightIntent, Reservations, Submission
 from app.ledger import open_ledger
 from app.replica import OccupancyReplica
-from app.scheduling import Limits, Scheduler
+from app.scheduling import FEW, Limits, Scheduler
 from app.writer import BatchReport, Policy, Writer
 from planner.aircraft import shipped_aircraft_types
 from planner.airspace import Airspace
@@ -64,6 +65,7 @@ class Process:
         policy: Policy = POLICY,
         limits: Limits = PERIODS,
         search: Search = Search.SAFE_INTERVAL,
+        few: int = FEW,
     ) -> None:
         self.location = location
         self.ledger = open_ledger(location, airspace, claim=True)
@@ -80,6 +82,7 @@ class Process:
         )
         scheduler = Scheduler(self.planner, performances, limits)
         self.deconfliction = Deconfliction(self.writer, self.ledger, scheduler, freshness_ms=5_000)
+        self.airspace_closing = AirspaceClosing(self.writer, self.ledger, scheduler, few=few)
         self.writer.start()
 
     def __enter__(self) -> Self:
@@ -169,3 +172,32 @@ def assert_journal_tells_states(ledger: str | Path | Stranger) -> None:
         states = dict(connection.rows("SELECT sequence, state || version FROM flight_intents"))
         entries = connection.rows("SELECT intent, kind || revision FROM journal WHERE intent > 0 ORDER BY revision")
     assert states == dict(entries)
+
+
+def assert_sound(process: Process, now_ms: int = 0) -> None:
+    """Fail unless table, index, counters and journal agree and nothing overlaps."""
+    assert_no_overlaps(process.location)
+    assert_gapless(process.location)
+    assert_journal_tells_states(process.location)
+    assert process.indexed(now_ms) == reserved(process.location, now_ms)
+
+
+def held(intent: FlightIntent) -> set[Hold]:
+    """Return an intent's reservations."""
+    columns: Reservations = intent.reservations
+    return set(zip(columns.block.tolist(), columns.enter_ms.tolist(), columns.exit_ms.tolist(), strict=True))
+
+
+def departure(intent: FlightIntent) -> int:
+    assert intent.trajectory is not None
+    return intent.trajectory.departure_ms
+
+
+def arrival(intent: FlightIntent) -> int:
+    assert intent.trajectory is not None
+    return intent.trajectory.arrival_ms
+
+
+def key(name: str, digest: str = "one body") -> IdempotencyKey:
+    """Return a key whose answers are rendered as their sequence numbers."""
+    return IdempotencyKey(name, digest, lambda outcome: str(outcome.intent.sequence).encode())

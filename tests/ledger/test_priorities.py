@@ -28,6 +28,7 @@ from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import Block, NoPlan, PlannerError
 from planner.occupancy import OccupancyIndex
 from planner.separation import verify
+from tests.ledger.commits import commit_and_fail, fail, on_next_commit
 from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, START_MS, STREET, district
 from tests.ledger.locations import Ledgers, on_sqlite
 from tests.ledger.process import (
@@ -40,7 +41,6 @@ from tests.ledger.process import (
     content,
     reserved,
 )
-from tests.ledger.test_writer import commit_and_fail, fail, on_next_commit
 
 YARD = district(".....\n..#..\n.....", ".....\n.....\n.....")
 # All flights begin and end in the lower layer, so that they meet.
@@ -206,7 +206,7 @@ class World:
         now_ms = self.clock.now_ms
         until_ms = None if lasts_ms is None else now_ms + after_ms + lasts_ms
         before, revision = everything(self.process), self.process.ledger.revision()
-        outcome = asyncio.run(self.process.deconfliction.close(closing(blocks, now_ms + after_ms, until_ms)))
+        outcome = asyncio.run(self.process.airspace_closing.close(closing(blocks, now_ms + after_ms, until_ms)))
         constraint = outcome.constraint
         hit = [flight for flight in before.values() if meet(closed(constraint, now_ms), held(flight))]
         movable = {flight.sequence for flight in hit if may_be_moved(flight, now_ms, None)}
@@ -224,7 +224,7 @@ class World:
             return
         constraint = self.constraints[which % len(self.constraints)]
         before = everything(self.process)
-        asyncio.run(self.process.deconfliction.reopen(constraint.id))
+        asyncio.run(self.process.airspace_closing.reopen(constraint.id))
         self.in_force.pop(constraint.number, None)
         assert [described(flight) for flight in everything(self.process).values()] == [
             described(flight) for flight in before.values()
@@ -384,7 +384,8 @@ def test_whatever_happens_only_who_may_be_moved_is_moved_and_nobody_overlaps(
     clock, location = FakeClock(), ledgers.migrated()
     with (
         Process(location, YARD.airspace, clock, limits=PERIODS) as one,
-        Process(location, YARD.airspace, clock, limits=PERIODS) as other,
+        # Whoever has to make way for what this one closes is planned ahead.
+        Process(location, YARD.airspace, clock, limits=PERIODS, few=0) as other,
     ):
         world = World((one, other), clock)
         for verb, *arguments in flights + steps:
@@ -467,6 +468,20 @@ def test_a_flight_that_departs_within_the_notice_is_not_moved(
     assert departures(street) == ({1: HOLD_MS, 2: 0} if is_moved else {1: 0, 2: HOLD_MS})
 
 
+def test_when_else_an_urgent_flight_could_fly_depends_on_who_flies_long_after_its_window(street: Process) -> None:
+    """Somebody who would make way is there, but not in the way."""
+    base_ms = DEPARTURE_MS + 100_000
+    back = STREET.submission("E", "W", earliest_ms=base_ms - CROSSING_MS, window_ms=0)
+    assert submitted(street, back).intent.state is State.ACCEPTED
+    count = 320_000 // HOLD_MS
+    for n in range(count):
+        submitted(street, along(1, earliest_ms=base_ms + n * HOLD_MS, window_ms=0))
+    refused = submitted(street, along(1, earliest_ms=base_ms, window_ms=0)).intent.refusal
+    assert refused is not None
+    # The last one has left the first block by then.
+    assert refused.earliest_feasible_departure_ms == base_ms + (count - 1) * HOLD_MS + 1_669
+
+
 def test_a_flight_that_was_activated_is_not_moved(street: Process) -> None:
     first = submitted(street, along(earliest_ms=DEPARTURE_MS + 60_000)).intent
     asyncio.run(street.deconfliction.activate(first.id))
@@ -477,9 +492,9 @@ def test_a_flight_that_was_activated_is_not_moved(street: Process) -> None:
 
 def test_who_has_made_way_departs_after_its_operator_has_had_notice(street: Process) -> None:
     shut = closing([STREET.block("W")], START_MS, START_MS + 70_000)
-    asyncio.run(street.deconfliction.close(shut))
+    asyncio.run(street.airspace_closing.close(shut))
     submitted(street, along(earliest_ms=START_MS))
-    asyncio.run(street.deconfliction.reopen(shut.id))
+    asyncio.run(street.airspace_closing.reopen(shut.id))
     assert departures(street) == {1: 10_000}
     # From now on the street is free, but nobody is sent off at once.
     submitted(street, along(1, earliest_ms=START_MS + 70_000))

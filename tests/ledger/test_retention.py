@@ -8,8 +8,7 @@ import pytest
 from app.flight_intents import FlightIntent, State
 from tests.ledger.district import SQUARE, STREET
 from tests.ledger.locations import database
-from tests.ledger.process import DAY_MS, POLICY, FakeClock, Process, reserved, until
-from tests.ledger.test_writer import arrival, key
+from tests.ledger.process import DAY_MS, POLICY, FakeClock, Process, arrival, key, reserved, until
 
 HOUR_MS = 3_600_000
 AN_HOUR = replace(POLICY, retention_ms=HOUR_MS, idempotency_ms=HOUR_MS)

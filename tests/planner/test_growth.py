@@ -122,7 +122,11 @@ def test_a_destination_reserved_for_an_hour_costs_a_few_expansions_not_the_whole
 def test_a_destination_in_a_closed_volume_costs_its_surroundings_not_the_whole_district() -> None:
     airspace = district()
     i, j, k = (axis.ravel() for axis in np.meshgrid(*map(np.arange, airspace.grid.dimensions), indexing="ij"))
-    closed = [(i, j, k) for i, j, k in zip(i, j, k, strict=True) if max(abs(i - 15), abs(j - SIDE // 2)) <= 8]
+    closed = [
+        (i, j, k)
+        for i, j, k in zip(i.tolist(), j.tolist(), k.tolist(), strict=True)
+        if max(abs(i - 15), abs(j - SIDE // 2)) <= 8
+    ]
     request = flight(SIDE * (SIDE // 2 + 1) - 1, airspace.grid.index((15, SIDE // 2, 0)), times=TIMES)
     waiting = planner_in(airspace, [Hold(airspace.grid.index(block), 0, HOUR_MS) for block in closed]).plan(request)
     assert waiting.arrival_ms >= HOUR_MS
