@@ -1,15 +1,15 @@
 """Domain error -> RFC 9457 problem: the only table of HTTP statuses."""
 
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import orjson
 import structlog
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
@@ -22,6 +22,8 @@ from planner.submitted import PathConflicts
 log = structlog.get_logger()
 
 MEDIA_TYPE = "application/problem+json"
+
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True)
@@ -209,8 +211,8 @@ HTTP_ERRORS = {
 INTERNAL = Kind("internal-error", 500, "Internal error", "Report `error_id`; the log has the details.")
 
 
-# So many things that are wrong with a body are told; who sends more of them has hardly read as many.
-MOST_ERRORS = 100
+# Who sends more that is wrong than this has hardly read as much.
+_MOST_TOLD = 100
 
 # What a body of several forms is told apart by stands in the place of an error like a member; it is none.
 FORMS = (":planned", ":trajectory", ":volumes")
@@ -261,12 +263,14 @@ def kind_of(error: Exception) -> Kind:
     raise KeyError(type(error))
 
 
+def document(kind: Kind, detail: str) -> dict[str, Any]:
+    """Return the members that all problems have."""
+    return {"type": f"/problems/{kind.slug}", "title": kind.title, "status": kind.status, "detail": detail}
+
+
 def body(kind: Kind, detail: str, members: Mapping[str, Any] | None = None) -> bytes:
     """Return a problem document."""
-    return orjson.dumps(
-        {"type": f"/problems/{kind.slug}", "title": kind.title, "status": kind.status, "detail": detail}
-        | dict(members or {})
-    )
+    return orjson.dumps(document(kind, detail) | dict(members or {}))
 
 
 def response(
@@ -330,14 +334,30 @@ def refusal_body(
     return body(KINDS[kind], refusal.detail, members | dict(more or {}))
 
 
-def with_one_unknown(document: object, model: type[BaseModel]) -> object:
-    """Return a document without the members that a model does not know, but for the first: it is refused for that one
-    already, and naming each of a hundred thousand would keep everybody waiting.
+def with_one_unknown(given: object, model: type[BaseModel]) -> object:
+    """Return what is given without the members that a model does not know, but for the first: it is refused for that
+    one already, and naming each of a hundred thousand would keep everybody waiting.
     """
-    if not isinstance(document, dict) or document.keys() <= model.model_fields.keys():
-        return document
-    unknown = next(name for name in document if name not in model.model_fields)
-    return {name: value for name, value in document.items() if name == unknown or name in model.model_fields}
+    if not isinstance(given, dict) or given.keys() <= model.model_fields.keys():
+        return given
+    unknown = next(name for name in given if name not in model.model_fields)
+    return {name: value for name, value in given.items() if name == unknown or name in model.model_fields}
+
+
+class StrictBody(BaseModel):
+    """A body, or a part of one, that is refused for the first member that it does not know."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _soon_refused(cls, given: object) -> object:
+        return with_one_unknown(given, cls)
+
+
+def told(found: Sequence[_Found]) -> Sequence[_Found]:
+    """Return so much of what is wrong with a body as is told; how much there is in all is said beside it."""
+    return found[:_MOST_TOLD]
 
 
 def install(app: FastAPI) -> None:
@@ -355,7 +375,7 @@ def install(app: FastAPI) -> None:
                 "msg": item["msg"].removeprefix("Value error, "),
                 "type": item["type"],
             }
-            for item in all_errors[:MOST_ERRORS]
+            for item in told(all_errors)
         ]
         members = {"errors": found, "error_count": len(all_errors)}
         if any(item["type"] == "json_invalid" for item in found):

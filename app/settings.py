@@ -72,6 +72,8 @@ class Settings(BaseSettings):
 
     queue_limit: Annotated[int, Field(ge=1)] = 1024
     max_body_bytes: Annotated[int, Field(ge=1024)] = 64 * 1024
+    # Of a flight intent, which may bring a path of thousands of entries.
+    max_intent_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
     max_telemetry_bytes: Annotated[int, Field(ge=1024)] = 2 * 1024 * 1024
     max_batch_bytes: Annotated[int, Field(ge=1024)] = 1024 * 1024
 

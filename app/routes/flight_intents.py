@@ -39,6 +39,9 @@ from planner.errors import NoPlan
 
 router = APIRouter(prefix=PATH, tags=["flight intents"])
 
+# The longest flights take most of a megabyte each: a page that has so much ends.
+_PAGE_BYTES = 32 * 1024 * 1024
+
 
 @router.post(
     "",
@@ -59,7 +62,8 @@ async def submit(
     moved and have not been activated. Those in its way are planned again at once; `displaced` says what became of them.
 
     With a `trajectory` of the operator's own instead, or `volumes`, that is checked and reserved as it is; where others
-    are in its way, a `path-conflicts` problem says where and proposes a plan.
+    are in its way, a `path-conflicts` problem says where and proposes a plan. Bodies may have up to a mebibyte unless
+    the server is set otherwise, which is enough for the longest of them.
     """
     body = spoken_for(caller, body)
     submission = await submitted(service, body)
@@ -108,7 +112,7 @@ def list_flight_intents(
     cursor: str | None = None,
 ) -> Response:
     """List intents in their order of arrival, an operator's own unless they may see all. Refused ones count with their
-    departure window.
+    departure window. A page of very long flights ends before its `limit`; `next_cursor` says whether there are more.
     """
     if operator is not None and not caller.may_see(operator):
         raise OperatorMismatch(f"the flight intents of operator {operator!r} are not yours to see")
@@ -118,9 +122,13 @@ def list_flight_intents(
     found = service.ledger.page(
         after_sequence=paging.decode(cursor), limit=limit + 1, operator=operator, state=state, from_ms=from_, to_ms=to
     )
-    intents = found[:limit]
-    items = [render(service.airspace.grid, intent) for intent in intents]
-    next_cursor = paging.encode(intents[-1].sequence) if len(found) > limit else None
+    items, size = [], 0
+    for intent in found[:limit]:
+        items.append(orjson.Fragment(text := orjson.dumps(render(service.airspace.grid, intent))))
+        size += len(text)
+        if size >= _PAGE_BYTES:
+            break
+    next_cursor = paging.encode(found[len(items) - 1].sequence) if len(found) > len(items) else None
     return Response(orjson.dumps({"items": items, "next_cursor": next_cursor}), media_type="application/json")
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple, TypeVar
 import numpy as np
 from anyio import CapacityLimiter, to_thread
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, WithJsonSchema, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, FailFast, Field, Tag, WithJsonSchema, model_validator
 
 from app import problems
 from app.auth import Caller
@@ -17,6 +17,7 @@ from app.errors import (
 )
 from app.flight_intents import Position, Submission
 from app.labels import Label
+from app.problems import StrictBody
 from app.routes.answers import BlockIndices, centres
 from app.service import Service
 from app.times import Timestamp
@@ -45,17 +46,15 @@ BlockBody = Annotated[
 _CHECKS_AT_ONCE = CapacityLimiter(2)
 
 
-class PositionBody(BaseModel):
+class PositionBody(StrictBody):
     """A position: WGS84 degrees, metres above the airspace's ground datum."""
-
-    model_config = ConfigDict(extra="forbid")
 
     lon: Annotated[Finite, Field(ge=-180, le=180)]
     lat: Annotated[Finite, Field(ge=-90, le=90)]
     alt_m: Finite
 
 
-class IntentBody(BaseModel):
+class IntentBody(StrictBody):
     """What all forms of a flight intent have in common."""
 
     operator: Annotated[Label | None, Field(description="Required without authentication; else the token's.")] = None
@@ -75,7 +74,6 @@ class FlightIntentBody(IntentBody):
     """What an operator asks for: a plan from an origin to a destination."""
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={
             "examples": [
                 {
@@ -117,7 +115,6 @@ class TrajectoryBody(IntentBody):
     """
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={
             "examples": [
                 {
@@ -135,7 +132,8 @@ class TrajectoryBody(IntentBody):
         },
     )
 
-    trajectory: Annotated[list[TrajectoryEntryBody], Field(min_length=2, max_length=MAX_ENTRIES)]
+    # Of entries that are none the first is told: thousands would take as long to look at as all that is right.
+    trajectory: Annotated[list[TrajectoryEntryBody], Field(min_length=2, max_length=MAX_ENTRIES), FailFast()]
 
     @model_validator(mode="after")
     def _window(self) -> "TrajectoryBody":
@@ -143,10 +141,8 @@ class TrajectoryBody(IntentBody):
         return self
 
 
-class VolumeBody(BaseModel):
+class VolumeBody(StrictBody):
     """A block, to be held from `enter` until before `exit`."""
-
-    model_config = ConfigDict(extra="forbid")
 
     block: BlockBody
     enter: Timestamp
@@ -161,7 +157,6 @@ class VolumesBody(IntentBody):
     """
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={
             "examples": [
                 {
@@ -182,7 +177,7 @@ class VolumesBody(IntentBody):
 
     origin: PositionBody
     destination: PositionBody
-    volumes: Annotated[list[VolumeBody], Field(min_length=1, max_length=MAX_ENTRIES)]
+    volumes: Annotated[list[VolumeBody], Field(min_length=1, max_length=MAX_ENTRIES), FailFast()]
 
     @model_validator(mode="after")
     def _window(self) -> "VolumesBody":

@@ -3,8 +3,9 @@
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
+import orjson
 from anyio import to_thread
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.config import JsonDict
@@ -21,6 +22,7 @@ from app.errors import (
     TooManyPositions,
 )
 from app.labels import Label
+from app.problems import StrictBody
 from app.service import ServiceDep
 from app.surveillance import Sighting
 from app.telemetry import Report
@@ -42,13 +44,10 @@ _EXAMPLE: JsonDict = {
 _Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
-class PositionReport(BaseModel):
+class PositionReport(StrictBody):
     """Where an aircraft was: of a flight intent, or of a track where only surveillance sees it."""
 
-    model_config = ConfigDict(
-        extra="forbid",
-        json_schema_extra={"examples": [_EXAMPLE]},
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     flight_intent_id: UUID | None = None
     track_id: Label | None = None
@@ -84,17 +83,16 @@ class Flag(BaseModel):
 
 
 class TelemetryAnswer(BaseModel):
-    """How many positions were taken, and what is to be said of single ones."""
+    """How many positions were taken, how many refused, and what is to be said of single ones."""
 
     accepted: int
+    problem_count: int
     problems: list[PositionProblem]
     flagged: list[Flag]
 
 
-class _Envelope(BaseModel):
+class _Envelope(StrictBody):
     """The body: positions, those of one aircraft in their order. Each is read, and taken or refused, for itself."""
-
-    model_config = ConfigDict(extra="forbid")
 
     positions: list[Any]
 
@@ -118,11 +116,14 @@ _SCOPE_FOR = {"flights": PLAN, "tracks": SURVEILLANCE}
 
 _POSITIONS = TypeAdapter(list[PositionReport])
 
+_JUMP = {"flag": "implausible-jump", "detail": "further from the last position than aircraft fly"}
+
 
 @router.post(
     "",
     status_code=202,
-    responses=problems.documented(400, 413, 422, 503),
+    response_class=Response,
+    responses={202: {"model": TelemetryAnswer}, **problems.documented(400, 413, 422, 503)},
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -131,17 +132,20 @@ _POSITIONS = TypeAdapter(list[PositionReport])
     },
     summary="Report positions",
 )
-async def report(service: ServiceDep, caller: CallerDep, request: Request) -> TelemetryAnswer:
+async def report(service: ServiceDep, caller: CallerDep, request: Request) -> Response:
     """Record where aircraft were. The answer is sent when that is durable; what is repeated is not recorded twice.
 
     Positions of the future, of another part of the world, of unknown flights or older than what is known are refused
     one by one. One that no aircraft can have reached from the last is taken, and flagged.
+
+    Each refused position has its problem, by `index`, but of those that are no positions at all only the first hundred.
+    `problem_count` is how many were refused.
     """
     telemetry = service.telemetry
-    read, refused = await to_thread.run_sync(_read, await request.body())
+    read, unreadable = await to_thread.run_sync(_read, await request.body())
     allowed = {kind: scope in caller.scopes for kind, scope in _SCOPE_FOR.items()}
     positions = [(index, position) for index, position in read if allowed[_kind(position)]]
-    refused |= {
+    refused: dict[int, PositionRefused] = {
         index: PositionNotAllowed(f"positions of {_kind(position)} need the scope {_SCOPE_FOR[_kind(position)]}")
         for index, position in read
         if not allowed[_kind(position)]
@@ -152,29 +156,24 @@ async def report(service: ServiceDep, caller: CallerDep, request: Request) -> Te
         if isinstance(entry, PositionRefused):
             refused[index] = entry
         elif entry:
-            flagged.append(
-                Flag(index=index, flag="implausible-jump", detail="further from the last position than aircraft fly")
-            )
+            flagged.append(index)
     accepted = sum(index not in refused for index, _ in positions)
-    service.metrics.positions(refused.values(), accepted)
-    return TelemetryAnswer(
-        accepted=accepted,
-        problems=[_problem(index, refused[index]) for index in sorted(refused)],
-        flagged=flagged,
-    )
+    service.metrics.positions([*unreadable.values(), *refused.values()], accepted)
+    # Thousands of refusals take a while to write down.
+    content = await to_thread.run_sync(_answer, accepted, unreadable, refused, flagged)
+    return Response(content, 202, media_type="application/json")
 
 
 def _read(body: bytes) -> tuple[list[tuple[int, Report]], dict[int, PositionRefused]]:
     """Return the positions that can be read, with their indices, and what is wrong with the others."""
     try:
-        items = _Envelope.model_validate(problems.with_one_unknown(from_json(body), _Envelope)).positions
+        items = _Envelope.model_validate(from_json(body)).positions
     except ValidationError as error:
         raise RequestValidationError([{**item, "loc": ("body", *item["loc"])} for item in error.errors()]) from error
     except ValueError as error:
         raise MalformedRequest(f"the body is not valid JSON: {error}") from error
     if len(items) > MAX_POSITIONS:
         raise TooManyPositions(f"{len(items)} positions; a report may have up to {MAX_POSITIONS}")
-    items = [problems.with_one_unknown(item, PositionReport) for item in items]
     refused: dict[int, PositionRefused] = {}
     try:
         read = _POSITIONS.validate_python(items)
@@ -205,8 +204,18 @@ def _kind(position: Report) -> str:
     return "flights" if position.track_id is None else "tracks"
 
 
-def _problem(index: int, error: PositionRefused) -> PositionProblem:
-    kind = problems.kind_of(error)
-    return PositionProblem(
-        index=index, type=f"/problems/{kind.slug}", title=kind.title, status=kind.status, detail=str(error)
+def _answer(
+    accepted: int, unreadable: dict[int, PositionRefused], refused: dict[int, PositionRefused], flagged: list[int]
+) -> bytes:
+    told = dict(problems.told([*unreadable.items()])) | refused
+    return orjson.dumps(
+        {
+            "accepted": accepted,
+            "problem_count": len(unreadable) + len(refused),
+            "problems": [
+                {"index": index, **problems.document(problems.kind_of(told[index]), str(told[index]))}
+                for index in sorted(told)
+            ],
+            "flagged": [{"index": index, **_JUMP} for index in flagged],
+        }
     )

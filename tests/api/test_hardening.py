@@ -14,15 +14,15 @@ from typing import Any
 
 import httpx
 import pytest
-import uvicorn
 from fastapi import FastAPI
 from starlette.responses import Response, StreamingResponse
 
 from app import problems
-from app.commands.serve import allow_files, configuration
+from app.commands.serve import allow_files
 from app.connections import MAX_HEAD_BYTES, MAX_HEADERS
 from app.main import create_app
 from app.settings import Settings
+from tests.api.listening import listening
 from tests.api.serving import Client, served, settings_for
 from tests.ledger.district import OLD_TOWN
 from tests.ledger.process import FakeClock
@@ -114,23 +114,6 @@ def drip(connection: socket.socket, pieces: Iterable[bytes]) -> bool:
     return False
 
 
-@contextmanager
-def listening(app: FastAPI, settings: Settings) -> Iterator[Service]:
-    """Serve an application as `airmatrix serve` does, on any free port."""
-    server = uvicorn.Server(configuration(app, settings))
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            # Its first kernels may have to be compiled, which no limit of a test should include.
-            while not server.started and thread.is_alive():
-                thread.join(0.01)
-            yield Service(listener.getsockname()[1])
-        finally:
-            server.should_exit = True
-            thread.join()
-
-
 def hasty(folder: Path, **options: Any) -> Settings:
     """Return settings of a service that waits for nobody."""
     times = {"head_timeout_s": 0.3, "body_timeout_s": 0.3, "send_timeout_s": 0.6}
@@ -159,7 +142,8 @@ def application(settings: Settings) -> FastAPI:
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     settings = hasty(tmp_path_factory.mktemp("hasty"), max_streams=2)
-    with listening(application(settings), settings) as running:
+    with listening(application(settings), settings) as port:
+        running = Service(port)
         yield running
         assert running.get("/health/ready").status_code == 200
 
@@ -247,7 +231,8 @@ def test_an_answer_that_is_read_slowly_but_steadily_is_sent_whole(service: Servi
 
 def test_one_connection_too_many_is_told_so_and_the_others_go_on(tmp_path: Path) -> None:
     settings = hasty(tmp_path, max_connections=3, head_timeout_s=_PATIENCE_S)
-    with listening(application(settings), settings) as service, ExitStack() as others:
+    with listening(application(settings), settings) as port, ExitStack() as others:
+        service = Service(port)
         held = [others.enter_context(service.connected()) for _ in range(3)]
         for connection in held:
             connection.sendall(_PLAIN + b"\r\n")
@@ -474,7 +459,8 @@ def test_who_says_that_it_came_by_https_is_not_believed(service: Service) -> Non
 
 def test_a_trusted_proxy_is_believed(tmp_path: Path) -> None:
     settings = hasty(tmp_path, trusted_proxies="127.0.0.0/8, ::1")
-    with listening(application(settings), settings) as service:
+    with listening(application(settings), settings) as port:
+        service = Service(port)
         by_https = {"X-Forwarded-Proto": "https"}
         assert service.get("/version", by_https).headers["strict-transport-security"] == "max-age=31536000"
         assert "strict-transport-security" not in service.get("/version").headers

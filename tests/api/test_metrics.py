@@ -349,7 +349,7 @@ def test_a_read_is_counted_under_its_route_and_moves_nothing_else(
         ("SWORDFISH", SUBMIT, {}, ("other", SUBMIT, 405), ("method-not-allowed",)),
         ("GET", "/v1/events?limit=0", {}, ("GET", "/v1/events", 422), ("validation-error",)),
         ("POST", SUBMIT, {"content": b"swordfish", "headers": JSON}, ("POST", SUBMIT, 400), ("malformed-request",)),
-        ("POST", SUBMIT, {"content": b"x" * 65_537}, ("POST", "other", 413), ("body-too-large",)),
+        ("POST", SUBMIT, {"content": b"x" * 1_048_577}, ("POST", "other", 413), ("body-too-large",)),
         ("GET", "/health/live", {"headers": {"Host": "swordfish"}}, ("GET", "other", 421), ("host-not-allowed",)),
         ("POST", SUBMIT, {"json": intent("A", "A")}, ("POST", SUBMIT, 422), ("not-plannable", "same_block")),
         ("POST", SUBMIT, {"json": intent("A", "Y")}, ("POST", SUBMIT, 422), ("not-plannable", "disconnected")),

@@ -84,7 +84,7 @@ def test_every_request_without_an_id_gets_one_of_its_own(client: Client) -> None
         ("POST", SUBMIT, {"content": b"{", "headers": {"Content-Type": "application/json"}}, 400),
         ("GET", "/nowhere", {}, 404),
         ("PUT", SUBMIT, {}, 405),
-        ("POST", SUBMIT, {"content": b"x" * 65_537}, 413),
+        ("POST", SUBMIT, {"content": b"x" * 1_048_577}, 413),
         ("GET", "/health/live", {"headers": {"Host": "airmatrix.example"}}, 421),
         ("POST", SUBMIT, {"json": intent("A", "A")}, 422),
     ],

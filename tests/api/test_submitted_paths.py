@@ -1,19 +1,26 @@
 """Paths that operators bring: reserved as they are, or refused with who is in the way and what would do."""
 
-from typing import Any
+import json
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from typing import Any, cast
 
 import httpx
 import pytest
 
+from app.flight_intents import FlightIntent, Refusal
+from app.ledger import Ledger
+from app.main import create_app
 from app.times import format_time, parse_time
 from planner.separation import CheckedFlight, verify
 from tests.api.bodies import PREVIEW, SUBMIT, intent, problem
-from tests.api.serving import Client
+from tests.api.serving import Client, served
 from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, LANES, START_MS
 from tests.ledger.locations import on_sqlite
 from tests.ledger.process import FakeClock
 
 KEY = {"Idempotency-Key": "first try"}
+_VOLUME = {"block": [0, 0, 0], "enter": format_time(START_MS), "exit": format_time(DEPARTURE_MS)}
 
 
 def planned(client: Client, origin: str = "W", destination: str = "E", **members: Any) -> dict[str, Any]:
@@ -154,6 +161,76 @@ def test_a_preview_of_a_trajectory_reserves_nothing(lanes: Client) -> None:
     assert (preview.status_code, preview.json()["submitted"]) == (200, True)
     assert preview.json()["reservations"] == plan["reservations"]
     assert lanes.get(SUBMIT).json()["items"] == []
+
+
+def to_and_fro(entries: int) -> list[dict[str, Any]]:
+    """Return a trajectory between two blocks, written as answers write it."""
+    grid = LANES.airspace.grid
+    ends = [{"block": list(grid.block(block)), **asdict(LANES.centre(grid.block(block)))} for block in (0, 1)]
+    times = (format_time(DEPARTURE_MS + 10_000 * n) for n in range(entries))
+    return [{**ends[n % 2], "arrive": time, "depart": time} for n, time in enumerate(times)]
+
+
+@on_sqlite
+def test_a_path_may_have_five_thousand_entries_written_as_generously_as_answers_are(lanes: Client) -> None:
+    body = own(to_and_fro(5_000))
+    assert len(json.dumps(body)) > 700_000
+    first = lanes.post(SUBMIT, json=body)
+    assert (first.status_code, len(first.json()["trajectory"])) == (201, 5_000)
+    preview = lanes.post(PREVIEW, json=own(first.json()["trajectory"]))
+    assert problem(preview, 409, "path-conflicts")["conflict_count"] == len(first.json()["reservations"])
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """In place of a ledger: whatever is asked for, there is the same flight again and again."""
+
+    intent: FlightIntent
+
+    def page(self, *, after_sequence: int, limit: int, **_: object) -> list[FlightIntent]:
+        return [replace(self.intent, sequence=after_sequence + 1 + n) for n in range(limit)]
+
+
+@on_sqlite
+def test_a_page_of_very_long_flights_ends_early_and_the_next_goes_on_from_there(lanes: Client) -> None:
+    intent = lanes.service.ledger.find(accepted(lanes, own(to_and_fro(2)))["id"])
+    assert intent is not None
+    # As long as a dozen of the longest, and sooner written down.
+    long = replace(intent, refusal=Refusal("of_length", "x" * 10 * 2**20))
+    service = replace(lanes.service, ledger=cast(Ledger, Repeated(long)))
+    with served(create_app(service.settings, running=service)) as client:
+        first = client.get(SUBMIT, params={"limit": 500}).json()
+        second = client.get(SUBMIT, params={"limit": 2, "cursor": first["next_cursor"]}).json()
+    assert [item["sequence"] for item in first["items"]] == [1, 2, 3, 4]
+    assert [item["sequence"] for item in second["items"]] == [5, 6]
+
+
+@on_sqlite
+def test_it_may_have_as_many_volumes(lanes: Client) -> None:
+    times = [format_time(DEPARTURE_MS + 1_000 * n) for n in range(626)]
+    blocks = [entry["block"] for entry in planned(lanes)["trajectory"]]
+    slices = [{"block": block, "enter": enter, "exit": exit_} for block in blocks for enter, exit_ in pairwise(times)]
+    assert len(slices) == 5_000
+    answer = accepted(lanes, volumes(slices))
+    assert {(held["enter"], held["exit"]) for held in answer["reservations"]} == {(times[0], times[-1])}
+
+
+@on_sqlite
+@pytest.mark.parametrize("name", ["trajectory", "volumes"])
+def test_one_entry_more_is_refused(lanes: Client, name: str) -> None:
+    body = own(to_and_fro(5_001)) if name == "trajectory" else volumes([_VOLUME] * 5_001)
+    answer = problem(lanes.post(SUBMIT, json=body), 422, "validation-error")
+    (error,) = answer["errors"]
+    assert (error["loc"], error["type"]) == (["body", name], "too_long")
+    assert "5000" in error["msg"]
+
+
+@on_sqlite
+def test_of_entries_that_are_none_the_first_is_told(lanes: Client) -> None:
+    for body in (own([*to_and_fro(2), {}, {}]), volumes([_VOLUME, _VOLUME, {}, {}])):
+        answer = problem(lanes.post(SUBMIT, json=body), 422, "validation-error")
+        assert {error["loc"][2] for error in answer["errors"]} == {2}
+        assert answer["error_count"] == len(answer["errors"]) == 3
 
 
 # Refusals that no traffic could change

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,7 +26,7 @@ from tests.ledger.process import FakeClock, until
 
 NOBODY = "01a2025d-cf8d-7793-bfd6-fd7be76cdfea"
 HOUR_MS = 3_600_000
-TAKEN = {"accepted": 1, "problems": [], "flagged": []}
+TAKEN = {"accepted": 1, "problem_count": 0, "problems": [], "flagged": []}
 
 
 def send(client: Client, *positions: Any) -> dict[str, Any]:
@@ -156,6 +157,7 @@ def test_a_refused_position_is_named_explained_and_harms_no_other(client: Client
     answer = send(client, seen(), position("A", START_MS, flight_intent_id=NOBODY), seen(track_id="radar-2"))
     assert answer == {
         "accepted": 2,
+        "problem_count": 1,
         "problems": [
             {
                 "index": 1,
@@ -368,6 +370,7 @@ def test_a_jump_that_no_aircraft_makes_is_taken_and_flagged(client: Client) -> N
     answer = send(client, seen(START_MS - 2000), seen(START_MS - 1000), seen(START_MS, "B"))
     assert answer == {
         "accepted": 3,
+        "problem_count": 0,
         "problems": [],
         "flagged": [
             {
@@ -422,16 +425,35 @@ def test_more_than_that_are_refused_as_a_whole(client: Client, settings: Setting
 
 
 @on_sqlite
+def test_of_positions_that_are_none_the_first_hundred_are_told_and_how_many_were_refused(client: Client) -> None:
+    answer = send(client, *[0] * 4_000, *[{}] * 998, seen(), seen(place="B"))
+    assert (answer["accepted"], answer["problem_count"]) == (1, 4_999)
+    assert slugs(answer) == dict.fromkeys(range(100), "invalid-position") | {4_999: "position-out-of-order"}
+
+
+@on_sqlite
+def test_all_that_are_refused_are_counted_told_or_not(client: Client) -> None:
+    send(client, *[0] * 150, seen(alt_m="high"), seen(START_MS + 60_000), seen())
+    counted = re.findall(r'^airmatrix_positions_total{outcome="(.+)"} (.+)$', client.get("/metrics").text, re.M)
+    assert {outcome: float(count) for outcome, count in counted if float(count)} == {
+        "invalid-position": 151,
+        "position-in-the-future": 1,
+        "accepted": 1,
+    }
+
+
+@on_sqlite
+def test_each_position_that_can_be_read_is_told_of_when_it_is_refused(client: Client) -> None:
+    answer = send(client, *(seen(START_MS + 60_000, track_id=f"radar-{n}") for n in range(300)))
+    assert (answer["accepted"], answer["problem_count"]) == (0, 300)
+    assert slugs(answer) == dict.fromkeys(range(300), "position-in-the-future")
+
+
+@on_sqlite
 @pytest.mark.parametrize(("size", "status"), [(2 * 2**20, 202), (2 * 2**20 + 1, 413)])
 def test_a_report_may_have_two_mebibytes(client: Client, size: int, status: int) -> None:
     content = '{"positions": []}'
     assert send_raw(client, content + " " * (size - len(content))).status_code == status
-
-
-@on_sqlite
-def test_what_is_no_report_may_have_no_more_than_before(client: Client) -> None:
-    answer = problem(client.post(SUBMIT, content=b" " * 65_537), 413, "body-too-large")
-    assert answer["detail"] == "bodies may have up to 65536 bytes"
 
 
 @on_sqlite

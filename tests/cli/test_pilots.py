@@ -59,7 +59,7 @@ def intent(
 
 def taken(positions: list[dict[str, Any]]) -> httpx.Response:
     """Answer that all positions were taken."""
-    return httpx.Response(202, json={"accepted": len(positions), "problems": [], "flagged": []})
+    return httpx.Response(202, json={"accepted": len(positions), "problem_count": 0, "problems": [], "flagged": []})
 
 
 @dataclass(eq=False)
@@ -426,7 +426,7 @@ def test_refusals_and_flags_are_counted_by_what_they_are() -> None:
     def answer(_: list[dict[str, Any]]) -> httpx.Response:
         problem = {"index": 0, "type": "/problems/position-out-of-order", "title": "", "status": 409, "detail": ""}
         flag = {"index": 0, "flag": "implausible-jump", "detail": ""}
-        return httpx.Response(202, json={"accepted": 0, "problems": [problem], "flagged": [flag]})
+        return httpx.Response(202, json={"accepted": 0, "problem_count": 1, "problems": [problem], "flagged": [flag]})
 
     service = StandIn([intent(1, 12)], on_telemetry=answer)
     report = fly(service)

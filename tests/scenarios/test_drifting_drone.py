@@ -45,7 +45,7 @@ def after(client: Client, clock: FakeClock, ms: int, lanes_flown: dict[str, floa
         for flight, lane in lanes_flown.items()
     ]  # fmt: skip
     answer = client.post(TELEMETRY, json=report(*positions)).json()
-    assert answer == {"accepted": len(positions), "problems": [], "flagged": []}
+    assert answer == {"accepted": len(positions), "problem_count": 0, "problems": [], "flagged": []}
     client.service.monitor.look()
 
 
