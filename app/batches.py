@@ -282,7 +282,7 @@ class Batches:
         first = transaction.sequence + 1
         settled: list[Plan | Refusal | None] = [None] * len(plans)
         for number, plan in enumerate(plans):
-            if plan is not None and plan.departure_ms >= now and not self._scheduler.in_the_way(plan):
+            if plan is not None and plan.departure_ms >= now and self._scheduler.is_free(plan):
                 index.reserve(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms, first + number)
                 settled[number] = plan
         mates = dict(enumerate(batch.ids, start=first))
@@ -305,7 +305,7 @@ class Batches:
 
     def _check(self, transaction: Transaction, now: int, batch: _Batch) -> None:
         for operator, count in Counter(submission.operator for submission in batch.submissions).items():
-            self._deconfliction.check_open_intents(transaction, operator, count)
+            self._deconfliction.check_open_intents(transaction, now, operator, count)
         for number, submission in enumerate(batch.submissions):
             try:
                 self._scheduler.check_window(submission, now)

@@ -17,6 +17,7 @@ from app.errors import (
     IdempotencyKeyReused,
     IllegalTransition,
     NotChangeable,
+    OutcomeUnknown,
     PreconditionFailed,
     TooManyOpenIntents,
     UnknownFlightIntent,
@@ -172,18 +173,28 @@ class Deconfliction:
             Nothing was changed.
         """
 
+        # What the last attempt found, and what it did.
+        before: list[FlightIntent] = []
         done: list[Outcome | Refusal] = []
 
         def run(transaction: Transaction, now: int) -> Outcome | Refusal:
-            done[:] = [self._change(transaction, now, intent_id, submission, versions)]
+            done.clear()
+            before[:] = [_found(transaction, intent_id)]
+            done[:] = [self._change(transaction, now, before[0], submission, versions)]
             return done[0]
 
         def look_up() -> Outcome | Refusal | None:
-            outcome, found = done[0] if done else None, self._ledger.find(intent_id)
-            if isinstance(outcome, Outcome):
-                is_done = found is not None and found.version == outcome.intent.version
-                return outcome if is_done else None
-            return outcome
+            if not done or isinstance(done[0], Refusal):
+                return done[0] if done else None
+            found = self._ledger.find(intent_id)
+            if found is not None and _is_same(found, done[0].intent):
+                return done[0]
+            if found is None or found.version != before[0].version:
+                raise OutcomeUnknown(
+                    "the commit failed, and then somebody else changed the flight intent: it is not known whether this "
+                    "change came before; read it, and change it again if it is not as you want it"
+                )
+            return None
 
         return await self._writer.perform(run, look_up, plans=True)
 
@@ -254,7 +265,7 @@ class Deconfliction:
                 )
             if first is not None:
                 return Outcome(first.intent, replayed=first.answer)
-        self.check_open_intents(transaction, submission.operator)
+        self.check_open_intents(transaction, now, submission.operator)
         try:
             plan = self._scheduler.plan(transaction, now, submission)
         except NoPlan as error:
@@ -273,11 +284,16 @@ class Deconfliction:
             )
         return outcome
 
-    def check_open_intents(self, transaction: Transaction, operator: str, more: int = 1) -> None:
-        """Raise `TooManyOpenIntents` if an operator may not have so many more flights that are not over."""
+    def check_open_intents(self, transaction: Transaction, now: int, operator: str, more: int = 1) -> None:
+        """Raise `TooManyOpenIntents` if an operator may not have so many more flights that are not over.
+
+        One that is cancelled or ended counts for as long as it holds something.
+        """
         limit = self._open_intents_limit
-        if limit is not None and transaction.count_open(operator, limit) + more > limit:
-            raise TooManyOpenIntents(f"operator {operator!r} may have {limit} flight intents that are not over")
+        if limit is not None and transaction.count_open(operator, limit, now) + more > limit:
+            raise TooManyOpenIntents(
+                f"operator {operator!r} may have {limit} flight intents that are not over, or still hold blocks"
+            )
 
     def _accept(
         self, transaction: Transaction, now: int, intent_id: str, submission: Submission, plan: Plan
@@ -300,20 +316,19 @@ class Deconfliction:
         self,
         transaction: Transaction,
         now: int,
-        intent_id: str,
+        before: FlightIntent,
         submission: Submission,
         versions: frozenset[int] | None,
     ) -> Outcome | Refusal:
         scheduler = self._scheduler
-        before = _found(transaction, intent_id)
         if versions is not None and before.version not in versions:
             raise PreconditionFailed(
-                f"flight intent {intent_id} has version {before.version} by now; read it, and change that"
+                f"flight intent {before.id} has version {before.version} by now; read it, and change that"
             )
         if before.submission.operator != submission.operator:
             raise NotChangeable("a flight intent stays with its operator")
         if before.state is State.DISPLACED:
-            self.check_open_intents(transaction, submission.operator)
+            self.check_open_intents(transaction, now, submission.operator)
         is_on_ground = self._is_on_ground_for_change(transaction, now, before)
         try:
             if is_on_ground:
@@ -374,11 +389,13 @@ class Deconfliction:
 
     def _is_down(self, transaction: Transaction, now: int, intent: FlightIntent, trajectory: Trajectory) -> bool:
         """Tell whether a flight's aircraft is known not to be in the air: it should not have departed yet and was not
-        seen flying; or it was reported on the ground, where it was to land, or just now.
+        seen anywhere but on its pad; or it was reported on the ground, where it was to land, or just now.
         """
         seen = self._newest_sighting(transaction, intent)
         if now < trajectory.departure_ms:
-            return seen is None or seen.airborne is not True
+            if seen is None or seen.airborne is not None:
+                return seen is None or seen.airborne is False
+            return self._block_of(seen) == int(trajectory.block[0])
         if seen is None or seen.airborne is not False or seen.time_ms < trajectory.departure_ms:
             return False
         return self._block_of(seen) == trajectory.block[-1] or now - seen.time_ms <= self._freshness_ms
@@ -407,6 +424,22 @@ class Deconfliction:
         # One that flew without having been activated becomes so as soon as it is seen to conform.
         state = State.ACTIVATED if intent.state is State.ACCEPTED else intent.state
         return transaction.change(intent, state, now, is_activated=True)
+
+
+def _is_same(found: FlightIntent, written: FlightIntent) -> bool:
+    """Tell whether an intent in the ledger is as it was written: another change may have got the same version."""
+    paths = [
+        None if path is None else (path.block.tolist(), path.arrive_ms.tolist(), path.depart_ms.tolist())
+        for path in (found.trajectory, written.trajectory)
+    ]
+    # The ledger keeps no submitted path but the trajectory.
+    submitted = replace(written.submission, path=None)
+    return (found.version, found.state, found.submission, paths[0]) == (
+        written.version,
+        written.state,
+        submitted,
+        paths[1],
+    )
 
 
 def _found(transaction: Transaction, intent_id: str) -> FlightIntent:

@@ -191,6 +191,10 @@ class Scheduler:
             "it can no longer be planned anew"
         )
 
+    def is_free(self, plan: Plan) -> bool:
+        """Tell whether nobody has reserved, and nothing closes, any of what a plan holds."""
+        return not self.index.owners_within(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
+
     def in_the_way(self, plan: Plan, own: FlightIntent | None = None) -> tuple[int, ...]:
         """Return the sequence numbers of the flights that would have to make way for a plan."""
         owners = self.index.owners_within(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
@@ -289,10 +293,7 @@ class Scheduler:
         if known is None or known.version != intent.version:
             return None
         plan = known.outcome
-        if isinstance(plan, Plan) and (
-            plan.departure_ms < now + self._limits.notice_ms
-            or self.index.owners_within(plan.hold_block, plan.hold_enter_ms, plan.hold_exit_ms)
-        ):
+        if isinstance(plan, Plan) and (plan.departure_ms < now + self._limits.notice_ms or not self.is_free(plan)):
             return None
         return plan
 

@@ -202,7 +202,8 @@ class Writer:
         again in another transaction: what it does outside the ledger and the replica has to bear that. An error of its
         own is raised here, and what it had written is undone; but a `RequestError` or `PlannerError` has to come before
         it writes anything that has no revision. `look_up` reads the answer from the ledger after a lost commit, None if
-        the work was not done. `plans` says that it is the planning of a flight, for metrics.
+        the work was not done, and raises `OutcomeUnknown` if that cannot be told. `plans` says that it is the planning
+        of a flight, for metrics.
 
         Raises
         ------
@@ -468,7 +469,7 @@ class Writer:
             try:
                 with self._ledger.transaction() as transaction:
                     transaction.touch()
-                found = [request.look_up() for request in taken]
+                found = [_looked_up(request) for request in taken]
                 lost = LedgerUnavailable("the commit failed; nothing was recorded")
                 return [lost if answer is None else answer for answer in found]
             except Exception as error:
@@ -523,6 +524,13 @@ class Writer:
         if not removed:
             self._kept_house_ms = now
         return removed
+
+
+def _looked_up(request: Request[T]) -> T | OutcomeUnknown | None:
+    try:
+        return request.look_up()
+    except OutcomeUnknown as error:
+        return error
 
 
 def _log_failure(report: BatchReport) -> None:

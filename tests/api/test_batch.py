@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 from threading import Event
@@ -10,6 +10,7 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import Connection
 
 from app.batches import Batches, BatchOutcome
 from app.errors import BatchNotPlanned, ItemRefused, QueueFull, TooManyRequests
@@ -18,9 +19,10 @@ from app.main import create_app
 from app.service import Service
 from tests.api.bodies import SUBMIT, intent, problem, recorded
 from tests.api.serving import Client, served, settings_for
+from tests.ledger.commits import commit_and_fail, on_commit
 from tests.ledger.district import DEPARTURE_MS, LANES
 from tests.ledger.locations import SqliteLedgers
-from tests.ledger.process import FakeClock, until
+from tests.ledger.process import FakeClock, closing, until
 
 BATCH = "/v1/flight-intents/batch"
 EAST, WEST = ("W", "E"), ("E", "W")
@@ -167,6 +169,25 @@ def test_a_plan_whose_blocks_were_reserved_meanwhile_is_made_anew_and_the_others
     assert outcome.comparison.first_come.total_ms == 0
     assert outcome.comparison.improved.total_ms == pytest.approx(first["delay_s"] * 1000)
     assert outcome.comparison.improvement.stopped_by == "shutdown"
+
+
+def test_a_plan_through_what_was_closed_meanwhile_is_made_anew(lanes: Client) -> None:
+    shut = closing([LANES.block("E")], DEPARTURE_MS, None)
+    outcome = submitted(lanes, lambda: lanes.portal.call(lanes.service.airspace_closing.close, shut), EAST, ("V", "F"))
+    refused, flown = outcome.intents
+    assert refused.refusal is not None
+    assert refused.refusal.conflicting_constraints == (shut.id,)
+    assert flown.state is State.ACCEPTED
+
+
+def test_a_batch_whose_commit_is_lost_is_looked_up(lanes: Client) -> None:
+    flights = [LANES.submission(*EAST), LANES.submission(*WEST)]
+    # The first one is that of a look at what is reserved.
+    commits: list[Callable[[Connection], object]] = [commit_and_fail, bool]
+    with on_commit(lambda connection: commits.pop()(connection) if commits else None):
+        outcome = lanes.portal.call(lanes.service.batches.submit, flights, 0.0, None, lambda: False)
+    assert [one.id for one in outcome.intents] == [one["id"] for one in listed(lanes)]
+    assert (len(outcome.intents), commits) == (2, [])
 
 
 def test_a_plan_whose_departure_has_passed_meanwhile_is_made_anew(lanes: Client, clock: FakeClock) -> None:

@@ -11,6 +11,7 @@ from app.main import create_app
 from app.routes.answers import FlightIntentAnswer
 from app.settings import Settings
 from app.times import format_time, parse_time
+from planner.errors import Block
 from tests.api.bodies import SUBMIT, TELEMETRY, intent, position, problem, report
 from tests.api.serving import Client, served, settings_for
 from tests.api.test_running import settings_with
@@ -310,6 +311,17 @@ def test_who_has_not_landed_since_its_departure_keeps_what_it_holds(
     elif last == "somewhere":
         see(street, flight["id"], MIDWAY_MS, (2, 0, 0), airborne=None)
     assert attempt(street, flight["id"], "end").json()["reservations"] == flight["reservations"]
+
+
+@on_sqlite
+@pytest.mark.parametrize(("place", "is_free"), [((0, 0, 0), True), ((2, 0, 0), False)])
+def test_before_its_departure_a_flight_is_down_where_it_stands_on_its_pad_if_nobody_says_whether_it_flies(
+    street: Client, clock: FakeClock, place: Block, is_free: bool
+) -> None:
+    flight = submit(street)
+    clock.now_ms = DEPARTURE_MS - 1
+    see(street, flight["id"], clock.now_ms, place, airborne=None)
+    assert (attempt(street, flight["id"], "end").json()["reservations"] == []) == is_free
 
 
 @on_sqlite

@@ -8,8 +8,13 @@ from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from uuid import uuid4
+
+import numpy as np
 
 from app.airspace_closing import AirspaceClosing
+from app.batches import Batches
+from app.constraints import Constraint
 from app.deconfliction import Deconfliction, IdempotencyKey, Outcome
 from app.flight_intents import FlightIntent, Reservations, Submission
 from app.ledger import open_ledger
@@ -83,6 +88,7 @@ class Process:
         scheduler = Scheduler(self.planner, performances, limits)
         self.deconfliction = Deconfliction(self.writer, self.ledger, scheduler, freshness_ms=5_000)
         self.airspace_closing = AirspaceClosing(self.writer, self.ledger, scheduler, few=few)
+        self.batches = Batches(self.writer, self.ledger, scheduler, self.deconfliction)
         self.writer.start()
 
     def __enter__(self) -> Self:
@@ -186,6 +192,13 @@ def held(intent: FlightIntent) -> set[Hold]:
     """Return an intent's reservations."""
     columns: Reservations = intent.reservations
     return set(zip(columns.block.tolist(), columns.enter_ms.tolist(), columns.exit_ms.tolist(), strict=True))
+
+
+def closing(blocks: Sequence[int], from_ms: int, until_ms: int | None) -> Constraint:
+    """Return a constraint over some blocks."""
+    return Constraint(
+        0, str(uuid4()), "a fire", {}, 0.0, None, from_ms, until_ms, np.array(sorted(blocks), dtype=np.int64), 0
+    )
 
 
 def departure(intent: FlightIntent) -> int:

@@ -13,8 +13,8 @@ from app.scheduling import FEW, Foreseen, Scheduler
 from planner.path import Plan
 from tests.ledger.district import DEPARTURE_MS, STREET
 from tests.ledger.locations import Ledgers
-from tests.ledger.process import FakeClock, Process, assert_sound
-from tests.ledger.test_priorities import along, closing, departures, described, everything, submitted
+from tests.ledger.process import FakeClock, Process, assert_sound, closing
+from tests.ledger.test_priorities import along, departures, described, everything, submitted
 
 Meanwhile = Callable[[Callable[[], object]], list[dict[int, Foreseen]]]
 

@@ -5,20 +5,20 @@ from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sqlalchemy import Engine, event
+from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import IntegrityError, OperationalError
 from structlog.testing import capture_logs
 
+from app.batches import BatchOutcome
 from app.commands.verify import checked
 from app.constraints import Constraint
 from app.deconfliction import Outcome
-from app.errors import IllegalTransition, LedgerUnavailable, PreconditionFailed, RequestError
+from app.errors import IllegalTransition, LedgerUnavailable, OutcomeUnknown, PreconditionFailed, RequestError
 from app.flight_intents import Displacement, FlightIntent, State, Submission
 from app.ledger import JournalEntry
 from app.replica import OccupancyReplica
@@ -28,7 +28,7 @@ from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import Block, NoPlan, PlannerError
 from planner.occupancy import OccupancyIndex
 from planner.separation import verify
-from tests.ledger.commits import commit_and_fail, fail, on_next_commit
+from tests.ledger.commits import commit_and_fail, fail, on_commit, on_next_commit
 from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, START_MS, STREET, district
 from tests.ledger.locations import Ledgers, on_sqlite
 from tests.ledger.process import (
@@ -38,7 +38,10 @@ from tests.ledger.process import (
     assert_gapless,
     assert_journal_tells_states,
     assert_no_overlaps,
+    assert_sound,
+    closing,
     content,
+    held,
     reserved,
 )
 
@@ -53,12 +56,6 @@ PERFORMANCE = {
 Flights = Mapping[int, FlightIntent]
 Held = tuple[int, int, int]
 Ends = Sequence[Block]
-
-
-def held(intent: FlightIntent) -> set[Held]:
-    """Return block, enter and exit of what an intent holds."""
-    columns = intent.reservations
-    return set(zip(columns.block.tolist(), columns.enter_ms.tolist(), columns.exit_ms.tolist(), strict=True))
 
 
 def described(intent: FlightIntent) -> tuple[object, ...]:
@@ -92,13 +89,6 @@ def may_be_moved(intent: FlightIntent, now_ms: int, below: int | None) -> bool:
         and intent.trajectory is not None
         and intent.trajectory.departure_ms >= now_ms + PERIODS.notice_ms
         and (below is None or intent.submission.priority < below)
-    )
-
-
-def closing(blocks: Sequence[int], from_ms: int, until_ms: int | None) -> Constraint:
-    """Return a constraint over some blocks."""
-    return Constraint(
-        0, str(uuid4()), "a fire", {}, 0.0, None, from_ms, until_ms, np.array(sorted(blocks), dtype=np.int64), 0
     )
 
 
@@ -217,6 +207,36 @@ class World:
         self.judge(before, revision, constraint, outcome.displaced)
         self.in_force[constraint.number] = constraint
         self.constraints.append(constraint)
+
+    def batch(self, flights: list[Ends], after_ms: int, priority: int, meanwhile: tuple[Any, ...]) -> None:
+        """Submit flights together; something else happens after they are planned, and before they are recorded."""
+        requests = [
+            replace(YARD.submission(*ends, earliest_ms=self.clock.now_ms + after_ms), priority=priority)
+            for ends in flights
+        ]
+        asked, seen = 0, [(everything(self.process), self.process.ledger.revision())]
+
+        def stop() -> bool:
+            nonlocal asked
+            asked += 1
+            # Each flight has to be planned once.
+            if asked == len(flights) + 1:
+                verb, *arguments = meanwhile
+                getattr(self, verb)(*arguments)
+                seen[:] = [(everything(self.process), self.process.ledger.revision())]
+            return asked > len(flights)
+
+        outcome = self.tried(self.process.batches.submit(requests, 1.0, None, stop))
+        before, revision = seen[0]
+        if not isinstance(outcome, BatchOutcome):
+            self.assert_unchanged(before, revision)
+            return
+        after = everything(self.process)
+        assert [described(after[n]) for n in before] == [described(flight) for flight in before.values()]
+        assert [described(after[flight.sequence]) for flight in outcome.intents] == [
+            described(flight) for flight in outcome.intents
+        ]
+        self.intents += outcome.intents
 
     def reopen(self, which: int) -> None:
         """Remove a constraint: everybody stays where they are."""
@@ -357,19 +377,31 @@ ENDS = st.lists(st.sampled_from(GROUND), min_size=2, max_size=2, unique=True)
 PRIORITIES, WHICH = st.integers(-2, 3), st.integers(0, 30)
 DELAYS_MS, WINDOWS_MS = st.sampled_from([30_000, 25_000, 0]), st.sampled_from([10_000, 0, 300_000])
 SUBMISSIONS = st.tuples(st.just("submit"), ENDS, DELAYS_MS, WINDOWS_MS, PRIORITIES)
+CHANGES = st.tuples(st.just("change"), WHICH, ENDS, st.one_of(st.none(), DELAYS_MS), WINDOWS_MS, PRIORITIES)
+MOVES = st.tuples(st.just("move"), WHICH, st.sampled_from(["activate", "activate", "activate", "cancel", "end"]))
+CLOSINGS = st.tuples(
+    st.just("close"),
+    st.lists(st.integers(0, YARD.airspace.grid.block_count - 1), min_size=1, max_size=3, unique=True),
+    st.sampled_from([0, 10_000, 30_000]),
+    st.sampled_from([5_000, 10_000, None]),
+)
+REOPENINGS = st.tuples(st.just("reopen"), WHICH)
+BATCHES = st.tuples(
+    st.just("batch"),
+    st.lists(ENDS, min_size=1, max_size=4),
+    DELAYS_MS,
+    PRIORITIES,
+    st.one_of(CLOSINGS, SUBMISSIONS, CHANGES, MOVES, REOPENINGS),
+)
 STEPS = st.one_of(
     SUBMISSIONS,
     SUBMISSIONS,
     SUBMISSIONS,
-    st.tuples(st.just("change"), WHICH, ENDS, st.one_of(st.none(), DELAYS_MS), WINDOWS_MS, PRIORITIES),
-    st.tuples(st.just("move"), WHICH, st.sampled_from(["activate", "activate", "activate", "cancel", "end"])),
-    st.tuples(
-        st.just("close"),
-        st.lists(st.integers(0, YARD.airspace.grid.block_count - 1), min_size=1, max_size=3, unique=True),
-        st.sampled_from([0, 10_000, 30_000]),
-        st.sampled_from([5_000, 10_000, None]),
-    ),
-    st.tuples(st.just("reopen"), WHICH),
+    BATCHES,
+    CHANGES,
+    MOVES,
+    CLOSINGS,
+    REOPENINGS,
     st.tuples(st.just("wait"), st.sampled_from([1, 2_000, 5_000, 10_000, 21_000])),
 )
 
@@ -417,13 +449,6 @@ def departures(process: Process) -> dict[int, int | None]:
         n: None if flight.trajectory is None else flight.trajectory.departure_ms - DEPARTURE_MS
         for n, flight in everything(process).items()
     }
-
-
-def assert_sound(process: Process) -> None:
-    assert_no_overlaps(process.location)
-    assert_gapless(process.location)
-    assert_journal_tells_states(process.location)
-    assert process.indexed(START_MS) == reserved(process.location, START_MS)
 
 
 # How long a flight holds the first block, and with it the street: no shorter distance keeps two apart.
@@ -675,6 +700,43 @@ def test_a_change_whose_commit_was_lost_is_not_taken_for_one_that_was_there_befo
     with on_next_commit(fail), pytest.raises(LedgerUnavailable):
         asyncio.run(street.deconfliction.change(first.id, along(), None))
     assert everything(street)[1].version == first.version
+
+
+@pytest.mark.parametrize("lost", [fail, commit_and_fail])
+def test_whether_a_change_was_made_before_somebody_else_made_another_is_not_known(
+    pair: tuple[Process, Process], monkeypatch: pytest.MonkeyPatch, lost: Callable[[Connection], None]
+) -> None:
+    one, other = pair
+    first = submitted(one, along()).intent
+    find = one.ledger.find
+
+    def find_too_late(intent_id: str) -> FlightIntent | None:
+        other.cancel(first)
+        return find(intent_id)
+
+    monkeypatch.setattr(one.ledger, "find", find_too_late)
+    with on_next_commit(lost), pytest.raises(OutcomeUnknown, match="somebody else changed"):
+        asyncio.run(one.deconfliction.change(first.id, along(1), None))
+
+
+def test_a_constraint_whose_commit_was_lost_is_in_force(street: Process) -> None:
+    first = submitted(street, along()).intent
+    shut = closing([STREET.block("W")], DEPARTURE_MS, DEPARTURE_MS + 5_000)
+    # The first commit is that of a look at who has to make way.
+    commits: list[Callable[[Connection], object]] = [commit_and_fail, bool]
+    with on_commit(lambda connection: commits.pop()(connection) if commits else None):
+        closed = asyncio.run(street.airspace_closing.close(shut))
+    assert closed.constraint.id == shut.id
+    assert [flight.id for flight in closed.displaced] == [first.id]
+    assert commits == []
+    assert_sound(street)
+
+
+def test_who_changes_to_a_lower_priority_makes_way(street: Process) -> None:
+    first = submitted(street, along()).intent
+    asyncio.run(street.deconfliction.change(first.id, along(-5), None))
+    assert [flight.sequence for flight in submitted(street, along()).displaced] == [1]
+    assert departures(street) == {1: HOLD_MS, 2: 0}
 
 
 def test_a_flight_in_the_air_can_be_changed_twice_at_once(street: Process, clock: FakeClock) -> None:
