@@ -168,7 +168,9 @@ class Batches:
         try:
             async with self._turn:
                 picture = await self._writer.perform(
-                    lambda transaction, now: self._picture(transaction, now, batch, improve_for_s), lambda: None
+                    lambda transaction, now: self._picture(transaction, now, batch, improve_for_s),
+                    lambda: None,
+                    has_key=key is not None,
                 )
                 if isinstance(picture, IdempotencyRecord):
                     return await to_thread.run_sync(self._replayed, batch, picture)
@@ -176,6 +178,7 @@ class Batches:
                 outcome = await self._writer.perform(
                     lambda transaction, now: self._record(transaction, now, batch, found),
                     lambda: self._look_up(batch, found),
+                    has_key=key is not None,
                 )
                 if isinstance(outcome, IdempotencyRecord):
                     return await to_thread.run_sync(self._replayed, batch, outcome)
@@ -186,8 +189,7 @@ class Batches:
     @cached_property
     def _planner(self) -> Planner:
         """A planner of its own, for the writer's serves the writer meanwhile."""
-        planner = self._scheduler.planner
-        return Planner(planner.airspace, planner.search, planner.hover_limit_ms, planner.detour_limit_ms)
+        return self._scheduler.planner.another()
 
     def _picture(
         self, transaction: Transaction, now: int, batch: _Batch, improve_for_s: float

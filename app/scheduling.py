@@ -230,9 +230,7 @@ class Scheduler:
 
         It `should_stop` before one or another: the rest is left out. Safe in any thread.
         """
-        planner = Planner(
-            self.planner.airspace, self.planner.search, self.planner.hover_limit_ms, self.planner.detour_limit_ms
-        )
+        planner = self.planner.another()
         foreseen: dict[int, Foreseen] = {}
         for intent in _in_turn(intents):
             if should_stop():

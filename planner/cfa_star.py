@@ -19,6 +19,7 @@ from planner.errors import (
     NoPlan,
     OriginBlocked,
     SameBlock,
+    SearchTooLong,
 )
 from planner.holds import holds_of
 from planner.kernels import labels as label_columns
@@ -42,6 +43,10 @@ _FEWEST_LABELS = 1 << 14
 MAX_SURCHARGE_MS = 60_000
 # A refusal names the flights around as many labels at most: a flight that is shut in has few.
 _SHUT_IN_LABELS = 100
+_TOO_LONG = (
+    "no plan was found within the work that one request may take: the way is too busy or closed for too much of the "
+    "window; ask for a shorter window, or a later one"
+)
 # How often a flight that would be in the air for too long is looked for again with a later departure.
 _LATER_DEPARTURES = 16
 
@@ -95,7 +100,7 @@ class Planner:
     """CFA* over one airspace and the reservations in `index`, or in another one. One thread at a time.
 
     `hover_limit_ms` bounds the greedy search's hovering in one place; `detour_limit_ms` how much longer than without
-    traffic a flight may be in the air, None for no bound.
+    traffic a flight may be in the air, `most_expansions` how much work a request may take; None for no bound.
     """
 
     def __init__(
@@ -104,11 +109,13 @@ class Planner:
         search: Search = Search.SAFE_INTERVAL,
         hover_limit_ms: int = 60_000,
         detour_limit_ms: int | None = None,
+        most_expansions: int | None = None,
     ) -> None:
         self.airspace = airspace
         self.search = search
         self.hover_limit_ms = hover_limit_ms
         self.detour_limit_ms = detour_limit_ms
+        self.most_expansions = most_expansions
         self.index = OccupancyIndex(airspace.grid.block_count)
         self._open_links = open_links(airspace)
         self._offsets = build_offsets(airspace.grid)
@@ -117,6 +124,12 @@ class Planner:
         self._workspace = new_workspace(airspace.grid.block_count, max(_FEWEST_LABELS, airspace.grid.block_count // 8))
         self._stamp = self._static_stamp = 0
         self._motions: dict[tuple[int, ...], Motion] = {}
+        # How many more expansions the present request may take.
+        self._left = UNREACHED
+
+    def another(self) -> "Planner":
+        """Return a planner with the same limits, and an index of its own."""
+        return Planner(self.airspace, self.search, self.hover_limit_ms, self.detour_limit_ms, self.most_expansions)
 
     def plan(self, request: PlanRequest, index: OccupancyIndex | None = None, *, outlook: bool = True) -> Plan:
         """Return a conflict-free plan; with the safe-interval search the one of earliest arrival.
@@ -140,6 +153,7 @@ class Planner:
         motion = self._motion(request.performance)
         bounds = self._bounds(motion, request.origin, request.destination)
         index = self.index if index is None else index
+        self._left = UNREACHED if self.most_expansions is None else self.most_expansions
         found = self._search(request, motion, bounds, index)
         if isinstance(found, Plan):
             return found
@@ -264,6 +278,7 @@ class Planner:
             self.hover_limit_ms,
             min(request.latest_departure_ms + in_air - self.airspace.terminal_dwell_ms, FAR_FUTURE),
             soonest,
+            most=0,
             stamp=0,
         )
         if self.search is Search.GREEDY:
@@ -275,6 +290,8 @@ class Planner:
             status, label, further = self._run(search_kernels.safe_interval, motion, index, task, bounds)
         expansions = bounds.expansions + further
         visits = int(self._workspace.around[VISITS])
+        if status == search_kernels.TOO_LONG:
+            return SearchTooLong(_TOO_LONG, expansions=expansions)
         if status == search_kernels.NO_DEPARTURE_SLOT:
             owners = index.owners(task.origin, task.earliest, task.latest + task.climb_out + 1)
             return NoDepartureSlot(
@@ -283,10 +300,8 @@ class Planner:
         if status == search_kernels.NO_PATH:
             return NoConflictFreePath(
                 "no conflict-free path leads from the first block within the departure window",
-                # Who has nowhere to land in time is not looked for on the way.
-                self._owners_around(index, label)
-                if further
-                else index.owners(task.destination, task.earliest, task.until),
+                # Who cannot land in time is not looked for on the way.
+                self._owners_around(index, label) if further else self._owners_at_the_end(index, task),
                 expansions=expansions,
             )
         plan = self._plan(motion, index, task, bounds, label, expansions, visits)
@@ -299,6 +314,8 @@ class Planner:
             visits += int(self._workspace.around[VISITS])
             if status == search_kernels.FOUND:
                 return self._plan(motion, index, task, bounds, label, expansions, visits)
+            if status == search_kernels.TOO_LONG:
+                return SearchTooLong(_TOO_LONG, expansions=expansions)
         return EnduranceExceeded(
             f"every conflict-free plan takes longer than the aircraft's endurance of {endurance / 1000:g} s",
             expansions=expansions,
@@ -307,7 +324,10 @@ class Planner:
     def _earliest_feasible_departure(
         self, request: PlanRequest, motion: Motion, bounds: Bounds, index: OccupancyIndex
     ) -> int | None:
-        """Return the earliest departure after the request's window from which there is a plan, None if none is near."""
+        """Return the earliest departure after the request's window from which there is a plan, None if none is near.
+
+        Where the work that is left does not suffice, it is the earliest one found, or none.
+        """
         earliest = None
         latest = request.latest_departure_ms + _OUTLOOK_MS
         while latest > request.latest_departure_ms:
@@ -339,6 +359,11 @@ class Planner:
                 )
         return tuple(owners)
 
+    def _owners_at_the_end(self, index: OccupancyIndex, task: Task) -> tuple[int, ...]:
+        """Return the owners of what lets nobody land in time, at the last block or around it."""
+        waited = np.flatnonzero(self._workspace.marks[:, label_columns.STAMP] == self._stamp - 1)[:_SHUT_IN_LABELS]
+        return index.owners_within(waited, np.full_like(waited, task.earliest), np.full_like(waited, task.until))
+
     def _run(
         self,
         kernel: Callable[..., tuple[int, int, int]],
@@ -349,9 +374,10 @@ class Planner:
     ) -> tuple[int, int, int]:
         """Run a search kernel, with a larger workspace as often as it asks for one."""
         while True:
-            stamped = task._replace(stamp=self._next_stamp())
+            stamped = task._replace(stamp=self._next_stamp(), most=self._left)
             outcome = kernel(self._open_links, motion, index.slabs, self._workspace, stamped, *rest)
             if outcome[0] != search_kernels.WORKSPACE_FULL:
+                self._left -= outcome[2]
                 return outcome
             self._workspace = larger_workspace(self._workspace)
 

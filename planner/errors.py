@@ -20,17 +20,22 @@ PlannerError
 │   ├── DwellTooShort         dwell_too_short
 │   ├── TooLong               too_long
 │   ├── BeyondEndurance       endurance_exceeded
+│   ├── OutOfReach            out_of_reach
 │   └── NotFlyable            not_flyable
 └── NoPlan                    dynamic: a property of the traffic at that moment
     ├── NoDepartureSlot       no_departure_slot
     ├── NoConflictFreePath    no_conflict_free_path
     ├── EnduranceExceeded     endurance_exceeded
+    ├── SearchTooLong         search_too_long
     └── PathConflicts         path_conflicts (in `planner.submitted`)
 """
 
 from typing import ClassVar
 
 Block = tuple[int, int, int]
+
+# Who waits behind hundreds on a busy pad need not be told of all.
+_MOST_FLIGHTS = 100
 
 
 class PlannerError(Exception):
@@ -156,6 +161,12 @@ class BeyondEndurance(PathRefused):
     reason = "endurance_exceeded"
 
 
+class OutOfReach(PathRefused):
+    """A volume that no chain of volumes leads to from where the flight departs: of no use to the aircraft."""
+
+    reason = "out_of_reach"
+
+
 class NotFlyable(PathRefused):
     """The aircraft has no way through the volumes."""
 
@@ -165,8 +176,8 @@ class NotFlyable(PathRefused):
 class NoPlan(PlannerError):
     """The traffic leaves no plan for this request.
 
-    `conflicting_owners` are the owners of the reservations in the way and `earliest_feasible_departure_ms` a
-    departure that would work, where known. `expansions` is what it took to find out.
+    `conflicting_owners` are the owners of the reservations in the way, of flights the first hundred, and
+    `earliest_feasible_departure_ms` a departure that would work, where known. `expansions` is what it took to find out.
     """
 
     reason: ClassVar[str]
@@ -179,7 +190,9 @@ class NoPlan(PlannerError):
         expansions: int = 0,
     ) -> None:
         super().__init__(message)
-        self.conflicting_owners = conflicting_owners
+        flights = [owner for owner in conflicting_owners if owner > 0]
+        untold = set(flights[_MOST_FLIGHTS:])
+        self.conflicting_owners = tuple(owner for owner in conflicting_owners if owner not in untold)
         self.expansions = expansions
         self.earliest_feasible_departure_ms = earliest_feasible_departure_ms
 
@@ -194,6 +207,12 @@ class NoConflictFreePath(NoPlan):
     """Departure is possible, arrival is not."""
 
     reason = "no_conflict_free_path"
+
+
+class SearchTooLong(NoPlan):
+    """No plan was found within the work that one request may take; there may be one."""
+
+    reason = "search_too_long"
 
 
 class EnduranceExceeded(NoPlan):

@@ -19,6 +19,7 @@ from planner.errors import (
     NotFlyable,
     NotPlannable,
     OutOfOrder,
+    OutOfReach,
     PathRefused,
     SameBlock,
     TooFast,
@@ -26,15 +27,18 @@ from planner.errors import (
 )
 from planner.holds import flat_index, in_order, links_of, merged, needed
 from planner.kernels.intervals import COUNT, ENTER, EXIT, FIRST, OWNER, ended_by
+from planner.links import DIRECTIONS
 from planner.occupancy import OccupancyIndex
 from planner.path import Plan
 
 MAX_ENTRIES = 5_000
-MAX_SPAN_MS = 86_400_000
 MAX_CONFLICTS = 100
 
 # Beyond any departure that a search looks for after the window it was given.
 _WAY_OFF_MS = 1 << 32
+
+# Block, enter, exit.
+_Volumes = tuple[IntArray, IntArray, IntArray]
 
 _Finding = tuple[BoolArray, type[PathRefused], Callable[[int], str]]
 
@@ -117,19 +121,26 @@ class PathConflicts(NoPlan):
 
 
 def trajectory_path(
-    airspace: Airspace, performance: Performance, blocks: IntArray, arrive_ms: IntArray, depart_ms: IntArray
+    airspace: Airspace,
+    performance: Performance,
+    blocks: IntArray,
+    arrive_ms: IntArray,
+    depart_ms: IntArray,
+    *,
+    longest_ms: int,
 ) -> SubmittedPath:
     """Check a trajectory and return it with its holds.
 
     The aircraft is in the centre of each of `blocks` (n, 3), i, j, k, from `arrive_ms` (n,) to `depart_ms` (n,), and
-    takes the straight link to the next: as slowly as it likes, but no faster than it is planned with.
+    takes the straight link to the next: as slowly as it likes, but no faster than it is planned with. From the first
+    moment to the last no more than `longest_ms` pass.
 
     Raises
     ------
     PathRefused
         For the first entry that breaks a rule.
     """
-    _check_trajectory(airspace, performance, blocks, arrive_ms, depart_ms)
+    _check_trajectory(airspace, performance, blocks, arrive_ms, depart_ms, longest_ms)
     held, enter_ms, exit_ms, entry = needed(airspace.rule, blocks, arrive_ms, depart_ms)
     hold_block = flat_index(airspace.grid, held)
     inside_building = airspace.occupied[hold_block]
@@ -149,12 +160,16 @@ def volumes_path(
     blocks: IntArray,
     enter_ms: IntArray,
     exit_ms: IntArray,
+    *,
+    longest_ms: int,
 ) -> SubmittedPath:
     """Check 4D volumes and return them merged, with the trajectory of earliest arrival that stays inside them.
 
-    Volumes are half-open intervals [enter, exit) of `blocks` (n, 3), i, j, k. A flight holds nothing before departure
-    or after arrival: so it departs when the origin's volume begins and arrives when the destination's ends, and
-    stands there meanwhile. Takes time and memory as the box of blocks that the volumes span.
+    Volumes are half-open intervals [enter, exit) of `blocks` (n, 3), i, j, k, within `longest_ms`. They hang together:
+    from the origin's a chain leads to each, every one in a block beside the last one's and overlapping it in time. A
+    flight holds nothing before departure or after arrival: so it departs when the origin's volume begins and arrives
+    when the destination's ends, and stands there meanwhile. Takes time and memory as the box of blocks that the
+    volumes span.
 
     Raises
     ------
@@ -167,7 +182,7 @@ def volumes_path(
         [
             _outside(airspace.grid, blocks),
             (enter_ms >= exit_ms, OutOfOrder, lambda _: "the volume ends before it begins, or at once"),
-            (exit_ms - begins_ms > MAX_SPAN_MS, TooLong, lambda _: "the volumes span more than a day"),
+            (exit_ms - begins_ms > longest_ms, TooLong, lambda _: f"the volumes span {_more_than(longest_ms)}"),
         ]
     )
     flat = flat_index(airspace.grid, blocks)
@@ -177,6 +192,10 @@ def volumes_path(
     for name, end in (("origin", origin), ("destination", destination)):
         if end not in volumes[0]:
             raise NotFlyable(f"no volume is of the {name}'s block, {list(airspace.grid.block(end))}")
+    belongs_to = np.searchsorted(_ordered(volumes, *volumes[:2]), _ordered(volumes, flat, enter_ms), side="right") - 1
+    unreached = ~_reached(airspace.grid, origin, volumes)[belongs_to]
+    chain = "no chain of volumes, each beside the one before and overlapping it in time, leads there from the origin's"
+    _refuse_first([(unreached, OutOfReach, lambda _: chain)])
     block, arrive_ms, depart_ms = _way_through(airspace, performance, origin, destination, volumes)
     in_air_ms, endurance_ms = int(depart_ms[-1] - arrive_ms[0]), performance.endurance_ms
     if endurance_ms is not None and in_air_ms > endurance_ms:
@@ -211,7 +230,12 @@ def conflicts(grid: AirMatrix, index: OccupancyIndex, path: SubmittedPath) -> Co
 
 
 def _check_trajectory(
-    airspace: Airspace, performance: Performance, blocks: IntArray, arrive_ms: IntArray, depart_ms: IntArray
+    airspace: Airspace,
+    performance: Performance,
+    blocks: IntArray,
+    arrive_ms: IntArray,
+    depart_ms: IntArray,
+    longest_ms: int,
 ) -> None:
     count, dwell_ms = len(blocks), airspace.terminal_dwell_ms
     if count < 2:
@@ -230,12 +254,12 @@ def _check_trajectory(
                 DwellTooShort,
                 lambda n: f"stays {stay_ms[n]} ms; taking off and landing hold a block for {dwell_ms} ms",
             ),
-            (depart_ms - arrive_ms[0] > MAX_SPAN_MS, TooLong, lambda _: "the flight lasts longer than a day"),
+            (depart_ms - arrive_ms[0] > longest_ms, TooLong, lambda _: f"the flight lasts {_more_than(longest_ms)}"),
         ]
     )
     planned_ms = performance.times.time[links_of(steps)]
     taken_ms = arrive_ms[1:] - depart_ms[:-1]
-    endurance_ms = MAX_SPAN_MS if performance.endurance_ms is None else performance.endurance_ms
+    endurance_ms = longest_ms if performance.endurance_ms is None else performance.endurance_ms
     _refuse_first(
         [
             (
@@ -269,12 +293,48 @@ def _no_neighbour(blocks: IntArray, n: int) -> str:
     return f"block {blocks[n].tolist()} is no neighbour of {blocks[n - 1].tolist()}"
 
 
+def _more_than(longest_ms: int) -> str:
+    return f"more than {longest_ms / 1000:g} s, the most that a path may"
+
+
+def _reached(grid: AirMatrix, origin: int, volumes: _Volumes) -> BoolArray:
+    """Tell which of volumes that are sorted by block and enter a chain leads to from the origin's first: (n,)."""
+    block, enter_ms, exit_ms = volumes
+    blocks = grid.ijk(block)
+    enters, exits = _ordered(volumes, block, enter_ms), _ordered(volumes, block, exit_ms)
+    # Those that overlap one in the block beside it follow one another: from a first to before a last, by direction.
+    first, last = [], []
+    for step in DIRECTIONS:
+        is_outside, _, _ = _outside(grid, blocks + step)
+        beside = np.where(is_outside, -1, flat_index(grid, blocks + step))
+        first.append(np.searchsorted(exits, _ordered(volumes, beside, enter_ms), side="right"))
+        last.append(np.searchsorted(enters, _ordered(volumes, beside, exit_ms), side="left"))
+    overlapping = np.stack([first, last], axis=-1).swapaxes(0, 1).tolist()
+    takes_off = int(np.argmax(block == origin))
+    reached, waiting = np.zeros(len(block), dtype=np.bool_), [takes_off]
+    reached[takes_off] = True
+    while waiting:
+        for begin, end in overlapping[waiting.pop()]:
+            for other in range(begin, end):
+                if not reached[other]:
+                    reached[other] = True
+                    waiting.append(other)
+    return reached
+
+
+def _ordered(volumes: _Volumes, block: IntArray, time_ms: IntArray) -> IntArray:
+    """Return numbers that order blocks and, within one, times from the first of some volumes to their last."""
+    _, enter_ms, exit_ms = volumes
+    begins_ms, ends_ms = int(enter_ms.min()), int(exit_ms.max())
+    return block * (ends_ms - begins_ms + 1) + time_ms - begins_ms
+
+
 def _way_through(
     airspace: Airspace,
     performance: Performance,
     origin: int,
     destination: int,
-    volumes: tuple[IntArray, IntArray, IntArray],
+    volumes: _Volumes,
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Search inside volumes that are sorted by block and enter; return block, arrive, depart, with the stands in the
     first and the last volume.

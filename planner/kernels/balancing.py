@@ -25,7 +25,15 @@ from planner.kernels.labels import (
 )
 from planner.kernels.motion import LEAD, OFFSET, STEPS, TAIL, TIME, VISITS, Motion, coordinates, first_start
 from planner.kernels.policy import kernel
-from planner.kernels.search import FOUND, NO_DEPARTURE_SLOT, NO_PATH, WORKSPACE_FULL, open_departures, open_label
+from planner.kernels.search import (
+    FOUND,
+    NO_DEPARTURE_SLOT,
+    NO_PATH,
+    TOO_LONG,
+    WORKSPACE_FULL,
+    open_departures,
+    open_label,
+)
 from planner.kernels.static_search import Bounds, time_to_go
 
 
@@ -78,6 +86,8 @@ def least_cost(
         size = pop(heap, size)
         if can_end(labels, label, task):
             return FOUND, label, expansions
+        if expansions == task.most:
+            return TOO_LONG, -1, expansions
         expansions += 1
         p, tau = labels[label, BLOCK], labels[label, G]
         i, j, k = coordinates(shape, p)

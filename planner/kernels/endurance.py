@@ -23,7 +23,7 @@ from planner.kernels.labels import (
 )
 from planner.kernels.motion import OFFSET, SIDE, SIDES, STEPS, TAIL, TIME, VISITS, Motion, coordinates, first_start
 from planner.kernels.policy import kernel
-from planner.kernels.search import FOUND, NO_PATH, WORKSPACE_FULL, open_departures, open_label
+from planner.kernels.search import FOUND, NO_PATH, TOO_LONG, WORKSPACE_FULL, open_departures, open_label
 from planner.kernels.static_search import Bounds, time_to_go
 
 
@@ -97,6 +97,8 @@ def within_endurance(
         size = pop(heap, size)
         if can_end(labels, label, task):
             return FOUND, label, expansions
+        if expansions == task.most:
+            return TOO_LONG, -1, expansions
         expansions += 1
         p = labels[label, BLOCK]
         i, j, k = coordinates(shape, p)

@@ -41,7 +41,7 @@ def earliest_landing(
     Nobody leaves a block of a way before a presence there, and has the time to go still to fly then: the arrival is no
     earlier than the largest such sum, on the way where that is least. Blocks are looked at in the order of it, from the
     destination back to where nobody has to wait: through all of a closed volume, but seldom beyond the first one.
-    Uses the heap, and marks with the stamp before the task's.
+    Uses the heap, and marks where one has to wait, and the destination, with the stamp before the task's.
     """
     shape, links, near = motion
     table, pool, _ = slabs
@@ -51,8 +51,6 @@ def earliest_landing(
         entering = min(entering, links[link, TIME] - links[link, LEAD])
     soonest = departure + bounds.optimum
     landing = earliest_presence(table, pool, task.destination, entering, task.dwell, task.earliest, soonest)
-    if landing == soonest:
-        return landing
     marks[task.destination, STAMP] = stamp
     size = push(heap, 0, landing, task.destination, task.destination)
     landing = FAR_FUTURE
@@ -64,7 +62,6 @@ def earliest_landing(
             n = p + links[link, OFFSET]
             if not (open_links[p] >> link) & 1 or marks[n, STAMP] == stamp:
                 continue
-            marks[n, STAMP] = stamp
             x, y, z = i + STEPS[link, 0], j + STEPS[link, 1], k + STEPS[link, 2]
             soonest = departure + lattice_time(shape, near, start[0] - x, start[1] - y, start[2] - z)
             present = soonest
@@ -74,5 +71,6 @@ def earliest_landing(
             if present == soonest:
                 landing = min(landing, max(behind, present + h))
             else:
+                marks[n, STAMP] = stamp
                 size = push(heap, size, max(behind, present + h), n, n)
     return landing if size == 0 else min(landing, heap[0, KEY])

@@ -43,7 +43,7 @@ from planner.kernels.motion import (
 from planner.kernels.policy import kernel
 from planner.kernels.static_search import Bounds, time_to_go
 
-FOUND, NO_DEPARTURE_SLOT, NO_PATH, WORKSPACE_FULL = range(4)
+FOUND, NO_DEPARTURE_SLOT, NO_PATH, WORKSPACE_FULL, TOO_LONG = range(5)
 
 # Arrivals within so many ms of the F under way are made at once, rather than come back for each.
 EAGERNESS = 1000
@@ -152,6 +152,8 @@ def safe_interval(
             continue
         if not labels[label, CLOSED] and can_end(labels, label, task):
             return FOUND, label, expansions
+        if expansions == task.most:
+            return TOO_LONG, -1, expansions
         expansions += 1
         if count + 26 > labels.shape[0] or size + 27 > heap.shape[0]:
             return WORKSPACE_FULL, -1, expansions
@@ -259,6 +261,8 @@ def greedy(open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, 
         labels[min_F, CLOSED] = 1
         if labels[min_F, BLOCK] == task.destination:
             return FOUND, min_F, expansions
+        if expansions == task.most:
+            return TOO_LONG, -1, expansions
         expansions += 1
         if count + 26 > labels.shape[0] or size + 27 > heap.shape[0]:
             return WORKSPACE_FULL, -1, expansions

@@ -180,6 +180,16 @@ def test_a_flight_whose_destination_is_closed_for_long_is_refused_at_once_where_
     assert planner.plan(flight(sketch["A"], sketch["B"], earliest=departure)).arrival_ms >= 5_000
 
 
+def test_a_flight_to_what_a_ring_of_closed_airspace_lies_around_is_refused_at_once() -> None:
+    sketch = drawn("A......B")
+    planner = Planner(sketch.airspace, detour_limit_ms=100)
+    planner.index.close({1: Closure(*columns((5, 0, 5_000), (6, 0, 5_000)))})
+    with pytest.raises(NoConflictFreePath) as refused:
+        planner.plan(flight(sketch["A"], sketch["B"], earliest=0, latest=10))
+    assert refused.value.conflicting_owners == (-1,)
+    assert refused.value.expansions < 12
+
+
 @pytest.mark.parametrize(("limit", "is_refused"), [(98, True), (99, False)])
 def test_a_flight_is_in_the_air_for_so_much_longer_than_alone_and_no_longer(limit: int, is_refused: bool) -> None:
     """It has to leave its pad by 1, and cannot land before 108: 107 ms for what takes 8 without traffic."""

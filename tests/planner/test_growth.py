@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from planner.airspace import Airspace, OccupancyRule
-from planner.cfa_star import Planner, PlanRequest
-from planner.errors import NoConflictFreePath
+from planner.cfa_star import Planner, PlanRequest, Search
+from planner.errors import NoConflictFreePath, NoDepartureSlot, SearchTooLong
 from planner.path import Plan
 from tests.planner.drawing import airspace_of
 from tests.planner.traffic import flight, planner_in, reserve
@@ -133,15 +133,20 @@ def test_a_destination_in_a_closed_volume_costs_its_surroundings_not_the_whole_d
     assert waiting.expansions <= 100
 
 
+def shut_for_a_minute(airspace: Airspace, destination: int) -> list[Hold]:
+    """Reserve all around a corner of the upper layer from when that is free: what no bound of the arrival foresees."""
+    i, j, k = airspace.grid.block(destination)
+    around = [(-1, 0, 0), (0, -1, 0), (0, 0, -1), (-1, 0, -1), (0, -1, -1), (-1, -1, 0), (-1, -1, -1)]
+    shut = [Hold(airspace.grid.index((i + x, j + y, k + z)), HOUR_MS, HOUR_MS + 60_000) for x, y, z in around]
+    return [Hold(destination, 0, HOUR_MS), *shut]
+
+
 def test_to_look_again_for_a_later_departure_costs_little_more() -> None:
     """All around the destination is reserved for a minute once that is free; somebody else comes to the origin."""
     airspace = district()
-    grid = airspace.grid
-    destination = grid.index((SIDE - 1, SIDE - 1, 1))
-    around = [(-1, 0, 1), (0, -1, 1), (0, 0, 0), (-1, 0, 0), (0, -1, 0), (-1, -1, 1), (-1, -1, 0)]
-    shut = [Hold(grid.index((SIDE - 1 + i, SIDE - 1 + j, k)), HOUR_MS, HOUR_MS + 60_000) for i, j, k in around]
-    origin = grid.index((SIDE - 1, 0, 0))
-    planner = planner_in(airspace, [Hold(destination, 0, HOUR_MS), *shut, Hold(origin, 10_000, HOUR_MS - 20_000)])
+    origin, destination = airspace.grid.index((SIDE - 1, 0, 0)), airspace.grid.index((SIDE - 1, SIDE - 1, 1))
+    shut = shut_for_a_minute(airspace, destination)
+    planner = planner_in(airspace, [*shut, Hold(origin, 10_000, HOUR_MS - 20_000)])
     request = flight(origin, destination, latest=HOUR_MS, times=TIMES)
     first = planner.plan(request)
     planner.detour_limit_ms = 60_000
@@ -164,3 +169,48 @@ def test_proof_that_there_is_no_path_is_as_short_as_what_shuts_the_flight_in() -
     with_path = planner.plan(flight(origin, destination, latest=30_000, times=TIMES))
     assert with_path.departure_ms == 20_000
     assert refusal.value.expansions <= with_path.expansions
+
+
+@pytest.mark.parametrize("search", Search)
+def test_a_request_takes_no_more_work_than_it_may(search: Search) -> None:
+    airspace = district()
+    ends = (0, SIDE * SIDE - 1)
+    whole = planner_in(airspace, search=search).plan(flight(*ends, times=TIMES))
+    needed = whole.expansions - whole.static_expansions
+    planner = planner_in(airspace, search=search)
+    planner.most_expansions = needed
+    # Again and again: each request may take as much.
+    assert [planner.plan(flight(*ends, times=TIMES)).arrival_ms for _ in range(3)] == [whole.arrival_ms] * 3
+    planner.most_expansions = needed - 1
+    with pytest.raises(SearchTooLong) as refusal:
+        planner.plan(flight(*ends, times=TIMES))
+    assert refusal.value.earliest_feasible_departure_ms is None
+    assert refusal.value.expansions == whole.expansions - 1
+
+
+def test_the_look_for_a_later_departure_takes_what_is_left_of_the_work() -> None:
+    airspace = district()
+    origin, destination = 0, SIDE * SIDE - 1
+    request = flight(origin, destination, times=TIMES)
+    planner = planner_in(airspace, [Hold(origin, 0, HOUR_MS)])
+    with pytest.raises(NoDepartureSlot) as refusal:
+        planner.plan(request)
+    assert refusal.value.earliest_feasible_departure_ms == HOUR_MS
+    planner.most_expansions = SIDE // 2
+    with pytest.raises(NoDepartureSlot) as refusal:
+        planner.plan(request)
+    assert refusal.value.earliest_feasible_departure_ms is None
+
+
+def test_a_workspace_that_grows_takes_none_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("planner.cfa_star._FEWEST_LABELS", 64)
+    airspace = district()
+    destination = airspace.grid.index((SIDE - 1, SIDE - 1, 1))
+    planner = planner_in(airspace, shut_for_a_minute(airspace, destination))
+    request = flight(0, destination, latest=HOUR_MS, times=TIMES)
+    first = planner.plan(request)
+    planner.most_expansions = first.expansions - first.static_expansions
+    again = planner.another()
+    labels = len(again._workspace.labels)
+    assert again.plan(request, planner.index).arrival_ms == first.arrival_ms
+    assert len(again._workspace.labels) > labels

@@ -5,6 +5,7 @@ In the stories' drawings an aircraft takes 4 ms for a level link or a vertical c
 """
 
 import itertools
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ from planner.errors import (
     NotFlyable,
     NotPlannable,
     OutOfOrder,
+    OutOfReach,
     PathRefused,
     TooFast,
     TooLong,
@@ -36,7 +38,6 @@ from planner.path import Plan
 from planner.separation import CheckedFlight, verify
 from planner.submitted import (
     MAX_CONFLICTS,
-    MAX_SPAN_MS,
     Conflict,
     SubmittedPath,
     conflicts,
@@ -64,6 +65,9 @@ unhurried = settings(deadline=None, max_examples=60)
 
 Entry = tuple[Block, int, int]
 
+# Longer than anything in the drawings but what is said to last for as long, or for longer.
+LONGEST_MS = 3_600_000
+
 
 def entries(rows: Sequence[Entry]) -> tuple[IntArray, IntArray, IntArray]:
     blocks, first, second = zip(*rows, strict=True)
@@ -71,12 +75,19 @@ def entries(rows: Sequence[Entry]) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def flown(airspace: Airspace, *stops: Entry, endurance_ms: int | None = None) -> SubmittedPath:
-    return trajectory_path(airspace, Performance(TIMES, endurance_ms), *entries(stops))
+    return trajectory_path(airspace, Performance(TIMES, endurance_ms), *entries(stops), longest_ms=LONGEST_MS)
 
 
 def through(city: Drawing, *volumes: Entry, endurance_ms: int | None = None) -> SubmittedPath:
     """Return the path from A to B inside volumes."""
-    return volumes_path(city.airspace, Performance(TIMES, endurance_ms), city["A"], city["B"], *entries(volumes))
+    return volumes_path(
+        city.airspace,
+        Performance(TIMES, endurance_ms),
+        city["A"],
+        city["B"],
+        *entries(volumes),
+        longest_ms=LONGEST_MS,
+    )
 
 
 def held(path: SubmittedPath) -> list[Hold]:
@@ -131,6 +142,7 @@ def slower_flights(draw: st.DrawFn, airspace: Airspace) -> SubmittedPath:
         indices(airspace, plan.block.tolist()),
         np.array(arrive, dtype=np.int64),
         np.array(depart, dtype=np.int64),
+        longest_ms=LONGEST_MS,
     )
 
 
@@ -142,8 +154,9 @@ def slower_flights(draw: st.DrawFn, airspace: Airspace) -> SubmittedPath:
 def test_what_our_own_planner_made_holds_what_the_planner_says(situation: Situation) -> None:
     plan = planned(situation)
     performance = performance_of(situation.request)
+    blocks = indices(situation.airspace, plan.block)
     path = trajectory_path(
-        situation.airspace, performance, indices(situation.airspace, plan.block), plan.arrive_ms, plan.depart_ms
+        situation.airspace, performance, blocks, plan.arrive_ms, plan.depart_ms, longest_ms=LONGEST_MS
     )
     assert held(path) == holds_in(plan)
     assert stops(path) == trajectory_of(plan)
@@ -208,7 +221,7 @@ THROUGH_A_CORNER = (((0, 0, 0), 0, 0), ((1, 1, 0), 6, 6))
         (OutOfOrder, 2, [((0, 0, 0), 0, 0), ((1, 0, 0), 9, 12), ((2, 0, 0), 11, 20)]),
         (TooFast, 1, [((0, 0, 0), 0, 0), ((1, 0, 0), 0, 0)]),
         (TooFast, 2, [((0, 0, 0), 0, 0), ((1, 0, 0), 4, 4), ((2, 1, 0), 9, 9)]),
-        (TooLong, 1, [((0, 0, 0), 0, 0), ((1, 0, 0), MAX_SPAN_MS, MAX_SPAN_MS + 1)]),
+        (TooLong, 1, [((0, 0, 0), 0, 0), ((1, 0, 0), LONGEST_MS, LONGEST_MS + 1)]),
         (OutOfOrder, 1, [((0, 0, 0), 0, 0), ((1, 0, 0), 9, 8), ((9, 0, 0), 20, 20)]),
     ],
 )
@@ -220,10 +233,8 @@ def test_a_trajectory_that_cannot_be_flown_is_refused_for_its_first_wrong_entry(
     assert (type(refusal.value), refusal.value.entry) == (error, entry)
 
 
-def test_a_flight_as_fast_as_the_aircraft_is_planned_and_as_long_as_a_day_is_flown() -> None:
-    path = flown(
-        OPEN.airspace, ((0, 0, 0), 0, 0), ((1, 0, 0), 4, MAX_SPAN_MS - 6), ((2, 1, 0), MAX_SPAN_MS, MAX_SPAN_MS)
-    )
+def test_a_flight_as_fast_as_the_aircraft_is_planned_and_as_long_as_it_may_be_is_flown() -> None:
+    path = flown(OPEN.airspace, ((0, 0, 0), 0, 0), ((1, 0, 0), 4, LONGEST_MS - 6), ((2, 1, 0), LONGEST_MS, LONGEST_MS))
     assert path.departure_ms == 0
 
 
@@ -285,6 +296,7 @@ def test_what_a_plan_holds_is_flyable_and_held_as_it_is(situation: Situation) ->
         indices(situation.airspace, plan.hold_block),
         plan.hold_enter_ms,
         plan.hold_exit_ms,
+        longest_ms=LONGEST_MS,
     )
     assert (path.departure_ms, path.depart_ms[-1]) == (plan.departure_ms, plan.arrival_ms)
     assert sum(hold.exit_ms - hold.enter_ms for hold in held(path)) == sum(
@@ -311,6 +323,24 @@ def volumes_in_traffic(draw: st.DrawFn) -> tuple[Situation, list[Hold]]:
     return Situation(airspace, tuple(taken), request), volumes
 
 
+def hanging_together(airspace: Airspace, origin: int, volumes: Sequence[Hold]) -> set[Hold]:
+    """Return the volumes that a chain leads to from the origin's: the definition, pair by pair."""
+    (start,) = (volume for volume in volumes if volume.block == origin)
+    reached, waiting = {start}, deque([start])
+    while waiting:
+        one = waiting.popleft()
+        for other in volumes:
+            steps = np.array(airspace.grid.block(one.block)) - airspace.grid.block(other.block)
+            if (
+                other not in reached
+                and np.abs(steps).max() == 1
+                and max(one.enter_ms, other.enter_ms) < min(one.exit_ms, other.exit_ms)
+            ):
+                reached.add(other)
+                waiting.append(other)
+    return reached
+
+
 @given(volumes_in_traffic())
 @unhurried
 def test_volumes_are_flyable_just_when_the_reference_finds_a_way_inside(
@@ -321,16 +351,22 @@ def test_volumes_are_flyable_just_when_the_reference_finds_a_way_inside(
     beyond = [Hold(block, 60, 90) for block in range(airspace.grid.block_count)]
     earliest = earliest_arrival(airspace, [*situation.reservations, *beyond], request)
 
-    def path() -> SubmittedPath:
+    def path(volumes: Sequence[Hold]) -> SubmittedPath:
         columns = [np.array(column, dtype=np.int64) for column in zip(*volumes, strict=True)]
-        blocks = indices(airspace, columns[0])
-        return volumes_path(airspace, request.performance, request.origin, request.destination, blocks, *columns[1:])
+        blocks, ends = indices(airspace, columns[0]), (request.origin, request.destination)
+        return volumes_path(airspace, request.performance, *ends, blocks, *columns[1:], longest_ms=LONGEST_MS)
 
+    reached = hanging_together(airspace, request.origin, volumes)
+    if len(reached) < len(volumes):
+        with pytest.raises(OutOfReach) as refusal:
+            path(volumes)
+        assert refusal.value.entry == next(n for n, volume in enumerate(volumes) if volume not in reached)
+        volumes = [volume for volume in volumes if volume in reached]
     if earliest is None:
         with pytest.raises(NotFlyable):
-            path()
+            path(volumes)
         return
-    found = path()
+    found = path(volumes)
     landing = found.arrive_ms[-1] + airspace.terminal_dwell_ms
     assert (found.departure_ms, landing, found.depart_ms[-1]) == (0, earliest, 59)
     assert verify(airspace, [checked("one", found)]).violations == ()
@@ -364,11 +400,11 @@ WIDE: list[Entry] = [((0, 0, 0), 0, 40), ((1, 0, 0), 0, 40), ((2, 0, 0), 0, 40)]
         (OutOfOrder, 1, [WIDE[0], ((1, 0, 0), 7, 7), WIDE[2]]),
         (EntryOutside, 3, [*WIDE, ((0, 1, 0), 0, 9)]),
         (InBuilding, 3, [*WIDE, ((3, 0, 0), 0, 9)]),
-        (TooLong, 2, [*WIDE[:2], ((2, 0, 0), 0, MAX_SPAN_MS + 1)]),
+        (TooLong, 2, [*WIDE[:2], ((2, 0, 0), 0, LONGEST_MS + 1)]),
         (OutOfOrder, 1, [WIDE[0], ((1, 0, 0), -1, 40), WIDE[2]]),
         (OutOfOrder, 1, [WIDE[0], ((1, 0, 0), 0, 41), WIDE[2]]),
         (NotFlyable, None, [WIDE[0], ((1, 0, 0), 0, 8), WIDE[2]]),
-        (NotFlyable, None, [WIDE[0], WIDE[2]]),
+        (OutOfReach, 1, [WIDE[0], WIDE[2]]),
         (NotFlyable, None, WIDE[1:]),
         (NotFlyable, None, WIDE[:2]),
     ],
@@ -379,6 +415,42 @@ def test_volumes_that_nobody_can_fly_in_are_refused(
     with pytest.raises(PathRefused) as refusal:
         through(LANE, *volumes)
     assert (type(refusal.value), refusal.value.entry) == (error, entry)
+
+
+# Blocks beside the lane are of use; those that lie apart, in place or in time, are not.
+PLAZA = drawn("..... A.B.. .....", ".....\n.....\n.....")
+
+
+@pytest.mark.parametrize(
+    ("entry", "further"),
+    [
+        (None, [((1, 2, 1), 39, 40)]),
+        (None, [((3, 2, 1), 0, 9), ((4, 2, 1), 8, 12)]),
+        (3, [((4, 1, 0), 0, 40)]),
+        (4, [((3, 2, 1), 0, 9), ((4, 2, 1), 9, 12)]),
+        # Two beside each other, and nobody comes to either; the first of them is named.
+        (3, [((4, 0, 0), 0, 40), ((4, 1, 0), 0, 40)]),
+        # Of one block, what touches is one volume; what does not is another.
+        (None, [((0, 1, 1), 0, 9), ((0, 1, 1), 9, 12)]),
+        (None, [((0, 0, 0), 0, 9), ((0, 0, 0), 10, 12)]),
+        (4, [((3, 0, 0), 0, 9), ((4, 0, 0), 20, 40), ((4, 0, 0), 3, 5)]),
+    ],
+)
+def test_volumes_hang_together_beside_one_another_and_at_the_same_time(entry: int | None, further: list[Entry]) -> None:
+    lane: list[Entry] = [((i, 1, 0), 0, 40) for i in range(3)]
+    if entry is None:
+        through(PLAZA, *lane, *further)
+        return
+    with pytest.raises(OutOfReach) as refusal:
+        through(PLAZA, *lane, *further)
+    assert refusal.value.entry == entry
+
+
+def test_rows_of_blocks_that_follow_one_another_in_memory_only_are_apart() -> None:
+    city = drawn("..B ..A")
+    with pytest.raises(OutOfReach) as refusal:
+        through(city, ((2, 0, 0), 0, 40), ((0, 1, 0), 0, 40), ((2, 1, 0), 0, 40))
+    assert refusal.value.entry == 1
 
 
 def test_an_aircraft_that_must_land_before_it_is_through_cannot_fly_there() -> None:
@@ -397,9 +469,8 @@ def test_an_aircraft_that_must_land_before_it_is_through_cannot_fly_there() -> N
 def test_conflicts_are_the_overlaps_with_who_is_there_first_ones_first(situation: Situation) -> None:
     airspace = situation.airspace
     plan = planned(replace(situation, reservations=()))
-    path = trajectory_path(
-        airspace, performance_of(situation.request), indices(airspace, plan.block), plan.arrive_ms, plan.depart_ms
-    )
+    blocks, performance = indices(airspace, plan.block), performance_of(situation.request)
+    path = trajectory_path(airspace, performance, blocks, plan.arrive_ms, plan.depart_ms, longest_ms=LONGEST_MS)
     overlaps = [
         Conflict(hold.block, max(hold.enter_ms, other.enter_ms), min(hold.exit_ms, other.exit_ms), owner)
         for hold in holds_in(plan)
