@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from anyio import to_thread
 
-from app.constraints import Constraint
-from app.errors import UnknownConstraint
+from app.constraints import MOST_CLOSED_BLOCKS, Constraint
+from app.errors import TooManyConstraints, UnknownConstraint
 from app.flight_intents import Displacement
 from app.ledger import Ledger, Transaction
 from app.scheduling import FEW, Cause, Foreseen, Scheduler
@@ -114,6 +114,7 @@ class AirspaceClosing:
     def _picture(self, transaction: Transaction, now: int, constraint: Constraint) -> _Picture | None:
         """Return what to plan ahead around, None where few have to make way."""
         scheduler = self._scheduler
+        self._check_room(constraint)
         movable = scheduler.within(transaction, now, constraint.closure).movable
         if len(movable) <= self._few:
             return None
@@ -135,12 +136,23 @@ class AirspaceClosing:
         self, transaction: Transaction, now: int, constraint: Constraint, foreseen: Mapping[int, Foreseen]
     ) -> Closed:
         scheduler = self._scheduler
+        self._check_room(constraint)
         with transaction.one_revision():
             recorded = transaction.record_constraint(constraint, now)
             hit = scheduler.within(transaction, now, recorded.closure)
             vacated = scheduler.vacate(transaction, now, hit.movable)
             scheduler.index.close({recorded.number: recorded.closure})
             numbered = {sequence: found.renumbered(_TO_COME, recorded.number) for sequence, found in foreseen.items()}
-            displaced = scheduler.settle(transaction, now, vacated, Cause(constraint_id=recorded.id), numbered)
-        ids = transaction.ids(hit.unmovable)
-        return Closed(recorded, displaced, tuple(ids[sequence] for sequence in hit.unmovable))
+            cause = Cause(constraint_id=recorded.id)
+            displaced = scheduler.settle(transaction, now, vacated, cause, numbered)
+            ids = transaction.ids(hit.unmovable)
+            unmoved = {sequence: ids[sequence] for sequence in hit.unmovable}
+            transaction.tell_unmoved(unmoved, cause.member(), now)
+        return Closed(recorded, displaced, tuple(unmoved.values()))
+
+    def _check_room(self, constraint: Constraint) -> None:
+        if self._scheduler.index.closed_count + len(constraint.blocks) > MOST_CLOSED_BLOCKS:
+            raise TooManyConstraints(
+                f"all constraints together may close {MOST_CLOSED_BLOCKS:,} blocks, each counted as often as it is "
+                "closed: make this one smaller, or remove others"
+            )

@@ -94,7 +94,7 @@ NEEDED: Mapping[tuple[str, str], frozenset[str]] = {
 RATED = frozenset(
     (method, path)
     for method, path in NEEDED
-    if path.startswith(("/v1/flight-intents", "/v1/webhooks")) and method != "GET"
+    if path.startswith(("/v1/flight-intents", "/v1/telemetry", "/v1/webhooks")) and method != "GET"
 )
 _PATTERNS = [(method, path, compile_path(path)[0]) for method, path in NEEDED]
 _SPELT_OUT = {path: {method for method, other in NEEDED if other == path} for _, path in NEEDED if "{" not in path}

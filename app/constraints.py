@@ -12,6 +12,10 @@ from planner.occupancy import Closure
 
 # So many may be in force or to come: each is asked, every second, which of the blocks in use belong to it.
 MOST_CONSTRAINTS = 500
+# So many blocks they may close together, each counted as often as it is closed: every process has them in memory.
+MOST_CLOSED_BLOCKS = 3_000_000
+# What the journal says of a flight that holds some of what a constraint closes and can no longer make way.
+UNMOVED = "unmoved"
 
 
 @dataclass(frozen=True, eq=False)

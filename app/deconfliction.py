@@ -92,7 +92,7 @@ class PreviewPlan:
 
 class Deconfliction:
     """Plans, records and changes flights by way of the writer. `freshness_ms`: for how long a position says where an
-    aircraft is.
+    aircraft is; `activation_lead_ms`: how long before its departure a flight may be activated (None: at any time).
     """
 
     def __init__(
@@ -102,6 +102,7 @@ class Deconfliction:
         scheduler: Scheduler,
         freshness_ms: int,
         open_intents_limit: int | None = None,
+        activation_lead_ms: int | None = None,
     ) -> None:
         self._writer = writer
         self._ledger = ledger
@@ -109,6 +110,7 @@ class Deconfliction:
         self._planner = scheduler.planner
         self._freshness_ms = freshness_ms
         self._open_intents_limit = open_intents_limit
+        self._activation_lead_ms = activation_lead_ms
 
     def check(self, origin: int, destination: int) -> None:
         """Raise the `NotPlannable` that applies to two blocks whatever the traffic. Safe in any thread."""
@@ -140,7 +142,7 @@ class Deconfliction:
                 return None
             return Outcome(first.intent, replayed=first.answer)
 
-        request = self._writer.enqueue(run, look_up, plans=True)
+        request = self._writer.enqueue(run, look_up, plans=True, has_key=key is not None)
         outcome = await asyncio.wrap_future(request.future)
         queue_s, plan_s = request.begun - request.arrived, request.ended - request.begun
         return replace(outcome, timing=Timing(queue_s, plan_s, time.perf_counter() - request.ended))
@@ -199,19 +201,14 @@ class Deconfliction:
         return await self._writer.perform(run, look_up, plans=True)
 
     async def cancel(self, intent_id: str) -> FlightIntent:
-        """Cancel an intent that is accepted or displaced. Before departure its reservations go, after it they stay
-        until arrival.
+        """Cancel an intent that is accepted or displaced. Its reservations go if its aircraft is known to be down; else
+        they stay until arrival, or until this is repeated when it is.
 
         Raises
         ------
         UnknownFlightIntent, IllegalTransition, QueueFull, LedgerUnavailable
         """
-
-        def look_up() -> FlightIntent | None:
-            intent = self._ledger.find(intent_id)
-            return intent if intent is not None and intent.state is State.CANCELLED else None
-
-        return await self._writer.perform(lambda transaction, now: self._cancel(transaction, now, intent_id), look_up)
+        return await self._finish(intent_id, State.CANCELLED, self._cancel)
 
     async def activate(self, intent_id: str) -> FlightIntent:
         """Take down that an accepted flight is about to fly, or flies; raises as `cancel`."""
@@ -223,19 +220,35 @@ class Deconfliction:
         return await self._writer.perform(lambda transaction, now: self._activate(transaction, now, intent_id), look_up)
 
     async def end(self, intent_id: str) -> FlightIntent:
-        """End a flight. One that has departed and was not reported landed keeps its reservations until its arrival;
-        raises as `cancel`.
+        """End a flight. One that has departed and was not reported landed keeps its reservations until its arrival, or
+        until this is repeated when it was; raises as `cancel`.
         """
+
+        def run(transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
+            intent = _found(transaction, intent_id)
+            if intent.state is State.ENDED:
+                return self._freed_if_down(transaction, now, intent)
+            return self.move(transaction, now, intent, State.ENDED)
+
+        return await self._finish(intent_id, State.ENDED, run)
+
+    async def _finish(
+        self, intent_id: str, state: State, run: Callable[[Transaction, int, str], FlightIntent]
+    ) -> FlightIntent:
+        """Have an intent brought to a state that it stays in, or more of what it holds freed there."""
+        done: list[FlightIntent] = []
+
+        def run_again(transaction: Transaction, now: int) -> FlightIntent:
+            done[:] = [run(transaction, now, intent_id)]
+            return done[0]
 
         def look_up() -> FlightIntent | None:
             intent = self._ledger.find(intent_id)
-            return intent if intent is not None and intent.state is State.ENDED else None
+            # Whatever came later has freed it too.
+            is_done = intent is not None and intent.state is state and bool(done) and intent.version >= done[0].version
+            return intent if is_done else None
 
-        def run(transaction: Transaction, now: int) -> FlightIntent:
-            intent = _found(transaction, intent_id)
-            return intent if intent.state is State.ENDED else self.move(transaction, now, intent, State.ENDED)
-
-        return await self._writer.perform(run, look_up)
+        return await self._writer.perform(run_again, look_up)
 
     def move(self, transaction: Transaction, now: int, intent: FlightIntent, state: State) -> FlightIntent:
         """Move an open flight to a state under the write lock; raises `IllegalTransition`.
@@ -245,12 +258,24 @@ class Deconfliction:
         if intent.state not in OPEN_STATES or intent.trajectory is None:
             raise IllegalTransition(f"flight intent {intent.id} is {intent.state} and cannot become {state}")
         is_over = state in (State.ENDED, State.CANCELLED)
-        is_free = is_over and self._is_down(transaction, now, intent, intent.trajectory)
-        changed = transaction.change(intent, state, now, is_free=is_free)
-        if is_free:
-            freed, kept = intent.reservations.beyond(now), changed.reservations.beyond(now)
-            self._planner.index.release(freed.block, freed.enter_ms, freed.exit_ms)
-            self._planner.index.reserve(kept.block, kept.enter_ms, kept.exit_ms, intent.sequence)
+        if is_over and self._is_down(transaction, now, intent, intent.trajectory):
+            return self._freed(transaction, now, intent, state)
+        return transaction.change(intent, state, now)
+
+    def _freed_if_down(self, transaction: Transaction, now: int, intent: FlightIntent) -> FlightIntent:
+        """Free what a flight that is over still holds, if its aircraft is known to be down by now."""
+        # What is freed ends with this millisecond.
+        holds = len(intent.reservations.beyond(now + 1)) > 0
+        if holds and intent.trajectory is not None and self._is_down(transaction, now, intent, intent.trajectory):
+            return self._freed(transaction, now, intent, intent.state)
+        return intent
+
+    def _freed(self, transaction: Transaction, now: int, intent: FlightIntent, state: State) -> FlightIntent:
+        """Bring a flight to a state in which it holds nothing from now on."""
+        changed = transaction.change(intent, state, now, is_free=True)
+        freed, kept = intent.reservations.beyond(now), changed.reservations.beyond(now)
+        self._planner.index.release(freed.block, freed.enter_ms, freed.exit_ms)
+        self._planner.index.reserve(kept.block, kept.enter_ms, kept.exit_ms, intent.sequence)
         return changed
 
     def _submit(
@@ -337,9 +362,12 @@ class Deconfliction:
                 plan = scheduler.continued(transaction, now, submission, before)
         except NoPlan as error:
             return refusal(error, transaction)
+        # Who is activated when it is due, and then departs later, would be out of everybody's reach.
+        activated_ms = None if is_on_ground and now < self._activated_from_ms(plan) else before.activated_ms
         after = replace(
             before,
-            state=State.ACCEPTED if before.activated_ms is None else State.ACTIVATED,
+            state=State.ACCEPTED if activated_ms is None else State.ACTIVATED,
+            activated_ms=activated_ms,
             submission=submission,
             trajectory=plan,
             reservations=reservations(plan),
@@ -375,7 +403,7 @@ class Deconfliction:
     def _cancel(self, transaction: Transaction, now: int, intent_id: str) -> FlightIntent:
         intent = _found(transaction, intent_id)
         if intent.state is State.CANCELLED:
-            return intent
+            return self._freed_if_down(transaction, now, intent)
         if intent.state is State.DISPLACED:
             return transaction.change(intent, State.CANCELLED, now)
         if intent.state is not State.ACCEPTED or intent.trajectory is None:
@@ -421,9 +449,19 @@ class Deconfliction:
                 f"flight intent {intent_id} should have arrived at {format_time(intent.trajectory.arrival_ms)} "
                 "and cannot be activated any more"
             )
+        if now < self._activated_from_ms(intent.trajectory):
+            raise IllegalTransition(
+                f"flight intent {intent_id} departs at {format_time(intent.trajectory.departure_ms)} "
+                f"and may be activated from {format_time(self._activated_from_ms(intent.trajectory))} on"
+            )
         # One that flew without having been activated becomes so as soon as it is seen to conform.
         state = State.ACTIVATED if intent.state is State.ACCEPTED else intent.state
         return transaction.change(intent, state, now, is_activated=True)
+
+    def _activated_from_ms(self, trajectory: Trajectory) -> int:
+        """Return from when on a flight may be activated."""
+        lead_ms = self._activation_lead_ms
+        return 0 if lead_ms is None else trajectory.departure_ms - lead_ms
 
 
 def _is_same(found: FlightIntent, written: FlightIntent) -> bool:

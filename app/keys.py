@@ -44,6 +44,10 @@ class UnusableKeys(Exception):
     """Not a set of keys, or none that can be used."""
 
 
+class NoUsableKey(UnusableKeys):
+    """A set of keys, none of which can be used."""
+
+
 @dataclass(frozen=True)
 class Key:
     """A public key, and the one algorithm that it is used with."""
@@ -61,6 +65,7 @@ def read_keys(content: bytes) -> Keys:
     Raises
     ------
     UnusableKeys
+        A `NoUsableKey` if this is a set of keys all the same.
     """
     try:
         items = orjson.loads(content)["keys"]
@@ -80,7 +85,7 @@ def read_keys(content: bytes) -> Keys:
             raise UnusableKeys(f"two keys have the same id, {kid!r}")
         keys[kid] = key
     if not keys:
-        raise UnusableKeys("no usable key" + "".join(f"; {flaw}" for flaw in flaws[:3]))
+        raise NoUsableKey("no usable key" + "".join(f"; {flaw}" for flaw in flaws[:3]))
     return keys
 
 
@@ -114,7 +119,8 @@ def _key(item: Mapping[str, Any]) -> tuple[str | None, Key]:
 class KeyStore:
     """The keys at a place, read again when they may have changed; what cannot be read leaves those that are known.
 
-    Raises `StartupError` where there are none to begin with.
+    A set without usable keys can be read: it takes back all that are known. Raises `StartupError` where there are none
+    to begin with.
     """
 
     def __init__(self, place: str, refresh_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -196,6 +202,11 @@ class KeyStore:
     def _renew(self) -> None:
         try:
             keys = self._read()
+        except NoUsableKey as error:
+            with suppress(OSError, ValueError):
+                log.error("there are no keys any more; no token is accepted", jwks=self._shown, error=str(error))
+            self._keys = {}
+            return
         except Exception as error:
             # Whatever is wrong there: with the keys that are known, tokens can be verified.
             with suppress(OSError, ValueError):

@@ -195,7 +195,7 @@ KINDS: dict[type[Exception], Kind] = {
     ),
     errors.OutcomeUnknown: Kind(
         "outcome-unknown", 503, "It is not known whether this was recorded",
-        "Read the flight intents, or repeat the request with the same Idempotency-Key.",
+        "Repeat the request with the same Idempotency-Key if it had one; else read first what there is.",
     ),
     errors.ReadOnlyServer: Kind(
         "read-only", 421, "This server only answers reads", "Send the request to a server that writes."
@@ -334,25 +334,21 @@ def refusal_body(
     return body(KINDS[kind], refusal.detail, members | dict(more or {}))
 
 
-def with_one_unknown(given: object, model: type[BaseModel]) -> object:
-    """Return what is given without the members that a model does not know, but for the first: it is refused for that
-    one already, and naming each of a hundred thousand would keep everybody waiting.
-    """
-    if not isinstance(given, dict) or given.keys() <= model.model_fields.keys():
-        return given
-    unknown = next(name for name in given if name not in model.model_fields)
-    return {name: value for name, value in given.items() if name == unknown or name in model.model_fields}
-
-
 class StrictBody(BaseModel):
-    """A body, or a part of one, that is refused for the first member that it does not know."""
+    """A body, or a part of one, that is refused for the first member that it does not know: naming each of a hundred
+    thousand would keep everybody waiting.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
     @model_validator(mode="before")
     @classmethod
-    def _soon_refused(cls, given: object) -> object:
-        return with_one_unknown(given, cls)
+    def _with_one_unknown(cls, given: object) -> object:
+        known = {field.alias or name for name, field in cls.model_fields.items()}
+        if not isinstance(given, dict) or given.keys() <= known:
+            return given
+        unknown = next(name for name in given if name not in known)
+        return {name: value for name, value in given.items() if name == unknown or name in known}
 
 
 def told(found: Sequence[_Found]) -> Sequence[_Found]:

@@ -122,6 +122,13 @@ class Scheduler:
             request = self.request(submission, now)
             if submission.priority <= transaction.lowest_priority:
                 return self.planner.plan(request)
+            try:
+                plan = self.planner.plan(request, outlook=False)
+                if not plan.delay_ms:
+                    # As early as can be, and nobody has to make way.
+                    return plan
+            except NoPlan:
+                pass
             until_ms = self.planner.ends_by(request)
             try:
                 index = self._unyielding(transaction, now, submission, request.earliest_departure_ms, until_ms)

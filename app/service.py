@@ -267,7 +267,11 @@ def _writing(
     settings = basis.settings
     warm_up()
     planner = Planner(
-        basis.airspace, settings.search, int(settings.hover_limit_s * 1000), int(settings.detour_limit_s * 1000)
+        basis.airspace,
+        settings.search,
+        int(settings.hover_limit_s * 1000),
+        int(settings.detour_limit_s * 1000),
+        settings.most_expansions,
     )
     policy = Policy(
         idempotency_ms=int(settings.idempotency_hours * 3_600_000),
@@ -291,7 +295,12 @@ def _writing(
     )
     scheduler = Scheduler(planner, basis.performances(), limits)
     deconfliction = Deconfliction(
-        writer, ledger, scheduler, _thresholds(settings).freshness_ms, settings.open_intents_limit
+        writer,
+        ledger,
+        scheduler,
+        _thresholds(settings).freshness_ms,
+        settings.open_intents_limit,
+        None if settings.activation_lead_s is None else int(settings.activation_lead_s * 1000),
     )
     telemetry = Telemetry(
         ledger,

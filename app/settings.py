@@ -45,9 +45,14 @@ class Settings(BaseSettings):
     hover_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 60.0
     # How much longer than without traffic a flight may be in the air.
     detour_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 300.0
+    most_expansions: Annotated[int, Field(ge=1)] = 300_000
+    # How long a path may last that an operator brings.
+    path_limit_s: Annotated[float, Field(gt=0, le=_LONGEST_S)] = 3_600.0
     ground_hold_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 300.0
     # So long before its departure a flight is no longer moved for others.
     notice_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] = 60.0
+    # So long before its departure a flight may be activated, which is no longer moved either; without it, at any time.
+    activation_lead_s: Annotated[float, Field(ge=0, le=_LONGEST_S)] | None = None
     # From so soon on a flight in the air can be planned anew.
     replan_lead_s: Annotated[float, Field(ge=0, le=600)] = 5.0
     horizon_days: Annotated[float, Field(gt=0, le=60)] = 30.0

@@ -23,7 +23,7 @@ from uuid_utils import uuid4
 
 from app.errors import LedgerUnavailable, OutcomeUnknown, QueueFull, WebhookRefused
 from app.ledger import Ledger, Transaction
-from app.ledger.webhooks import Desk, Line, Waiting, Webhook, WebhookRows
+from app.ledger.webhooks import Desk, Lease, Line, Waiting, Webhook, WebhookRows
 from app.webhooks import Destinations, body, delivery_id, kind_of, retry_after_ms, signature
 from app.writer import Request, Writer
 
@@ -35,7 +35,8 @@ DELIVERED, FAILED, GIVEN_UP, LOST = OUTCOMES = ("delivered", "failed", "given_up
 _EVERY_S, _AFTER_FAILURE_S, _PATIENCE_S = 0.25, 1.0, 5.0
 # Events older than this are given up when they fail once more.
 _GIVE_UP_MS = 86_400_000
-# The desk is held for so long from every record on. Nothing is sent that might not be answered before that ends.
+# The desk is held for so long from every record on; clocks differ, so others let that pass by their own after they have
+# seen a record. Nothing is sent that might not be answered before it ends.
 _DESK_MS, _MARGIN_MS = 20_000, 7_000
 # How many journal entries are read at once. Where so many events wait, the rest stays in the journal.
 _LINES, _MOST_WAITING = 256, 10_000
@@ -158,8 +159,10 @@ class Deliverer:
         self._observe = observe
         self._chance = chance
         self._holder = str(uuid4())
-        # Until when the desk is surely ours, as far as recorded.
+        # Until when the desk is surely ours, as far as recorded; the lease that was seen last, and since when.
         self._held_until_ms = 0
+        self._lease: Lease | None = None
+        self._lease_since_ms = 0
         # Through which revisions the journal was read where nothing was found since.
         self._read_through: dict[int, int] = {}
         self._recorded_ms = 0
@@ -226,6 +229,8 @@ class Deliverer:
             desk, due = (rows.desk(), rows.due_webhooks(now)) if webhooks else (None, [])
         if desk is None:
             return []
+        if desk.lease != self._lease or now < self._lease_since_ms:
+            self._lease, self._lease_since_ms = desk.lease, now
         newest = desk.revision
         # After a failover that lost commits, revisions are not what they were.
         self._read_through = {
@@ -254,19 +259,24 @@ class Deliverer:
 
     async def _has_desk(self, desk: Desk, now: int) -> bool:
         """Tell whether this process has the desk, after trying to take or to keep it where that is needed."""
-        if desk.holder != self._holder and now < desk.until_ms <= now + _DESK_MS:
+        if desk.holder != self._holder and desk.until_ms > 0 and self._over(now) is None:
             self._held_until_ms = 0
             return False
         if desk.holder == self._holder and self._held_until_ms - now > _DESK_MS / 2:
             return True
         return await self._record(lambda *_: None)
 
+    def _over(self, now: int) -> Lease | None:
+        """Return the lease that was seen last if it has not been renewed in its time."""
+        return self._lease if now - self._lease_since_ms >= _DESK_MS else None
+
     async def _record(self, work: Work) -> bool:
         """Have something written down, if the desk is ours or free; then it is ours for a while from now on."""
+        over = self._over(self._clock())
 
         def run(transaction: Transaction, now: int) -> int:
             with transaction.webhooks() as rows:
-                if not rows.hold_desk(self._holder, now, _DESK_MS):
+                if not rows.hold_desk(self._holder, now + _DESK_MS, over):
                     return 0
                 work(rows, now)
                 return now + _DESK_MS

@@ -13,6 +13,7 @@ from anyio import to_thread
 from uuid_utils import uuid7
 
 from app.addresses import is_loopback
+from app.constraints import UNMOVED
 from app.errors import TooManyWebhooks, UnknownWebhook, WebhookRefused
 from app.flight_intents import State
 from app.ledger import JournalEntry, Ledger, Transaction
@@ -113,7 +114,7 @@ def _is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
 
 def kind_of(journal_kind: str) -> str:
     """Return to which kind of subscription an event of a flight intent belongs."""
-    return INTENT if journal_kind in _STATES else CONFORMANCE
+    return INTENT if journal_kind in _STATES or journal_kind == UNMOVED else CONFORMANCE
 
 
 def delivery_id(webhook: Webhook, entry: JournalEntry) -> str:

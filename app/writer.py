@@ -74,8 +74,8 @@ class Replica(Protocol):
 class Request(Generic[T]):
     """One request in the queue: what to do under the write lock, how to find out whether it was done, whom to tell.
 
-    `plans` tells whether it asks for a flight's plan. Times are of `time.perf_counter`: when it arrived, when the work
-    on it began and ended.
+    `plans` tells whether it asks for a flight's plan, `has_key` whether asking again with the same Idempotency-Key does
+    nothing twice. Times are of `time.perf_counter`: when it arrived, when the work on it began and ended.
     """
 
     run: Callable[[Transaction, int], T]
@@ -84,8 +84,15 @@ class Request(Generic[T]):
     future: "Future[T]"
     context: Mapping[str, object]
     arrived: float
+    has_key: bool = False
     begun: float = 0.0
     ended: float = 0.0
+
+    def unknown(self, why: str) -> OutcomeUnknown:
+        """Return the answer if nobody knows whether it was done: why, and what its sender can do."""
+        if self.has_key:
+            return OutcomeUnknown(f"{why}; repeat the request with the same Idempotency-Key")
+        return OutcomeUnknown(f"{why}; read first what there is, then repeat the request if it is not done")
 
 
 @dataclass(frozen=True)
@@ -194,7 +201,12 @@ class Writer:
         return 0.0 if first is None else time.perf_counter() - first.arrived
 
     async def perform(
-        self, run: Callable[[Transaction, int], T], look_up: Callable[[], T | None], *, plans: bool = False
+        self,
+        run: Callable[[Transaction, int], T],
+        look_up: Callable[[], T | None],
+        *,
+        plans: bool = False,
+        has_key: bool = False,
     ) -> T:
         """Do work under the write lock, and return its answer once it is durable.
 
@@ -203,7 +215,7 @@ class Writer:
         own is raised here, and what it had written is undone; but a `RequestError` or `PlannerError` has to come before
         it writes anything that has no revision. `look_up` reads the answer from the ledger after a lost commit, None if
         the work was not done, and raises `OutcomeUnknown` if that cannot be told. `plans` says that it is the planning
-        of a flight, for metrics.
+        of a flight, for metrics; `has_key`, that it does nothing twice when it is asked for again.
 
         Raises
         ------
@@ -212,10 +224,15 @@ class Writer:
         OutcomeUnknown
             The commit was lost, and the ledger cannot be asked.
         """
-        return await asyncio.wrap_future(self.enqueue(run, look_up, plans=plans).future)
+        return await asyncio.wrap_future(self.enqueue(run, look_up, plans=plans, has_key=has_key).future)
 
     def enqueue(
-        self, run: Callable[[Transaction, int], T], look_up: Callable[[], T | None], *, plans: bool = False
+        self,
+        run: Callable[[Transaction, int], T],
+        look_up: Callable[[], T | None],
+        *,
+        plans: bool = False,
+        has_key: bool = False,
     ) -> Request[T]:
         """Queue work as `perform` does, and return the request, whose future has the answer.
 
@@ -231,6 +248,7 @@ class Writer:
             future=Future(),
             context=structlog.contextvars.get_contextvars(),
             arrived=time.perf_counter(),
+            has_key=has_key,
         )
         with self._open:
             if not self.is_running:
@@ -319,9 +337,7 @@ class Writer:
             answers = [error if isinstance(error, LedgerUnavailable) else unknown] * len(taken)
         except BaseException:
             for request in taken:
-                request.future.set_exception(
-                    OutcomeUnknown("the ledger writer has died; repeat the request with the same Idempotency-Key")
-                )
+                request.future.set_exception(request.unknown("the ledger writer has died"))
             raise
         for request, answer in zip(taken, answers, strict=True):
             if isinstance(answer, BaseException):
@@ -474,11 +490,8 @@ class Writer:
                 return [lost if answer is None else answer for answer in found]
             except Exception as error:
                 if time.monotonic() > give_up:
-                    unknown = OutcomeUnknown(
-                        f"the commit failed, and then the ledger ({error}): it is not known whether this was recorded; "
-                        "read the flight intents, or repeat the request with the same Idempotency-Key"
-                    )
-                    return [unknown] * len(taken)
+                    why = f"the commit failed, and then the ledger ({error}): it is not known whether this was recorded"
+                    return [request.unknown(why) for request in taken]
             time.sleep(_RETRY_S)
 
     def _keep_house(self, *, idle: bool) -> None:
@@ -521,6 +534,8 @@ class Writer:
                 removed += transaction.remove_ended(before_ms, _REMOVE_INTENTS)
                 removed += transaction.forget_constraints(before_ms, _REMOVE_INTENTS)
                 removed += transaction.remove_journal(before_ms, _REMOVE_ENTRIES)
+            if not removed:
+                transaction.refresh_lowest_priority()
         if not removed:
             self._kept_house_ms = now
         return removed

@@ -82,6 +82,11 @@ class OccupancyIndex:
         """The numbers under which something is closed."""
         return frozenset(self._closures)
 
+    @property
+    def closed_count(self) -> int:
+        """How many blocks are closed, each counted for each closure."""
+        return self._closed_rows.shape[1]
+
     def close(self, closures: Mapping[int, Closure]) -> None:
         """Close blocks under numbers above 0; the owner of what is closed is the negative number."""
         self._closures.update(closures)
@@ -113,8 +118,9 @@ class OccupancyIndex:
         return copied
 
     def without(self, owners: IntArray, from_ms: int = 0, to_ms: int = intervals.FAR_FUTURE) -> "OccupancyIndex":
-        """Return a copy of what overlaps [from, to) without the reservations of one or more owners; closures, whenever
-        they are, reach where those were.
+        """Return a copy of what overlaps [from, to), without the reservations of one or more owners.
+
+        Closures reach where those were.
         """
         first_owner = int(owners.min())
         is_dropped = np.zeros(int(owners.max()) - first_owner + 1, dtype=np.bool_)
@@ -127,7 +133,8 @@ class OccupancyIndex:
         copied._size = int(copied.slabs.table[:, intervals.COUNT].sum())
         copied._closures = dict(self._closures)
         copied._closed_rows, copied._is_closed = self._closed_rows, self._is_closed
-        copied._lay_closures(np.flatnonzero(self._is_closed))
+        closed = self._closed_rows[:, (self._closed_rows[2] > from_ms) & (self._closed_rows[1] < to_ms)]
+        copied._insert(intervals.close_blocks, *closed)
         return copied
 
     def forget_before(self, time_ms: int) -> int:

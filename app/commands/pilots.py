@@ -23,6 +23,7 @@ import numpy as np
 from app.client import Client, ProblemAnswer, ServiceUnreachable
 from app.commands.deviations import Deviations, Flown
 from app.commands.flight_model import Way, places, planned_way
+from app.constraints import UNMOVED
 from app.flight_intents import OPEN_STATES, State
 from app.routes.answers import FlightIntentAnswer
 from app.routes.events import Event
@@ -204,8 +205,8 @@ class Dispatch:
         if event.kind in (State.CANCELLED, State.DISPLACED):
             self._forget_what_is_due(id_)
             self.found.put((id_, None))
-        elif (event.kind == State.ACCEPTED and id_ not in self._numbers) or event.details:
-            # Only what was planned again has details.
+        elif (event.kind == State.ACCEPTED and id_ not in self._numbers) or (event.details and event.kind != UNMOVED):
+            # Otherwise only what was planned again has details.
             self._forget_what_is_due(id_)
             self._read(id_)
 

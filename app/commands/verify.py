@@ -14,6 +14,7 @@ from app.ledger import open_ledger, parse_location
 from app.service import load_airspace
 from app.settings import Settings
 from app.times import format_time
+from app.trespasses import Trespass, trespasses
 from planner.airmatrix import AirMatrix
 from planner.airspace import OccupancyRule
 from planner.path import Trajectory
@@ -27,20 +28,25 @@ def verify(
     ledger: Annotated[str | None, typer.Option(help="Ledger file or URL.")] = None,
     airspace: Annotated[Path | None, typer.Option(help="Airspace file. Default: the shipped one.")] = None,
 ) -> None:
-    """Check every reservation and trajectory of a ledger with none of the planner's code; exit 1 on a violation."""
+    """Check every reservation and trajectory of a ledger, and that nobody holds closed airspace who was planned around
+    it or could have made way, with none of the planner's code; exit 1 on a violation.
+    """
     settings = Settings.given(ledger=ledger, airspace=airspace)
     field = load_airspace(settings)
     with closing(open_ledger(settings.ledger, field)) as book:
-        intents, unknown = book.everything()
         removed_ms = book.removed().before_ms
+        with book.snapshot() as snapshot:
+            intents, unknown = snapshot.intents()
+            trespassing = trespasses(snapshot, intents)
     flights = [checked(intent) for intent in intents if intent.trajectory is not None or len(intent.reservations)]
     flights += [_flight(f"unknown intent {sequence}", held, None) for sequence, held in unknown.items()]
     with progress_bar("checking", 1.0) as advance_to:
         report = judge(field, flights, lambda _, fraction: advance_to(fraction))
     states = {state: sum(intent.state is state for intent in intents) for state in State}
     strays = [flight.id for flight in flights if len(flight.block) == 0 < len(flight.hold_block)]
-    _print(report, states, removed_ms, strays, f"{parse_location(settings.ledger)}: {field.name}", field.grid)
-    if strays or not report.ok:
+    title = f"{parse_location(settings.ledger)}: {field.name}"
+    _print(report, states, removed_ms, strays, trespassing, title, field.grid)
+    if strays or trespassing or not report.ok:
         raise typer.Exit(1)
 
 
@@ -81,6 +87,7 @@ def _print(
     states: dict[State, int],
     removed_ms: int | None,
     strays: list[str],
+    trespassing: list[Trespass],
     title: str,
     grid: AirMatrix,
 ) -> None:
@@ -92,6 +99,7 @@ def _print(
     table.add_row("judged", judged + (f" ({report.released} released)" if report.released else ""))
     for kind, count in _counts(report).items():
         table.add_row(kind, str(count))
+    table.add_row("constraint violations", str(len(trespassing)))
     promise = "" if report.rule is OccupancyRule.CONTAINMENT else " (not promised under the midpoint rule)"
     closest, vertical, clearance = report.closest, report.closest_vertical, report.clearance
     table.add_row(
@@ -110,6 +118,10 @@ def _print(
     show(table)
     for stray in strays[:_SHOWN]:
         remark("violation", "red", f"reservations that belong to no flight ({stray})")
+    for trespass in trespassing[:_SHOWN]:
+        remark("violation", "red", _reproach(trespass, grid))
+    if len(trespassing) > _SHOWN:
+        remark("violation", "red", f"… and {len(trespassing) - _SHOWN} more in closed airspace")
     for violation in report.violations[:_SHOWN]:
         remark("violation", "red", _sentence(violation))
     if len(report.violations) > _SHOWN:
@@ -136,3 +148,10 @@ def _sentence(violation: Violation) -> str:
     detail = f": {violation.detail}" if violation.detail else ""
     span = f"{format_time(violation.from_ms)} to {format_time(violation.to_ms)}"
     return f"{violation.kind} ({', '.join(violation.flights)}), block {list(violation.block)}, {span}{detail}"
+
+
+def _reproach(trespass: Trespass, grid: AirMatrix) -> str:
+    intent, constraint, block, from_ms, to_ms = trespass.overlap
+    span = f"{format_time(from_ms)} to {format_time(to_ms)}"
+    why = f"{trespass.reason}, {constraint.id} ({constraint.name})"
+    return f"reservation in closed airspace ({intent.id}), block {list(grid.block(block))}, {span}: {why}"

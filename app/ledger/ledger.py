@@ -16,7 +16,8 @@ from app.flight_intents import FlightIntent, HeldReservations, Reservations, Sta
 from app.ledger import constraints, positions, queries
 from app.ledger.database import Database
 from app.ledger.queries import IdempotencyRecord, JournalEntry
-from app.ledger.rows import by_intent, to_held, to_intent
+from app.ledger.rows import to_intent
+from app.ledger.snapshot import Snapshot
 from app.ledger.tables import counters, flight_intents, reservations
 from app.ledger.transaction import ConstraintViolated, Transaction, cause_of
 from app.ledger.webhooks import WebhookRows
@@ -170,16 +171,15 @@ class Ledger:
         return [to_intent(row, self._airspace, held[row.sequence]) for row in rows]
 
     def everything(self) -> tuple[list[FlightIntent], dict[int, Reservations]]:
-        """Return all intents by sequence, and reservations that name an intent which does not exist, as of one moment.
+        """Return all intents by sequence, and reservations that name no intent that there is, as of one moment."""
+        with self.snapshot() as snapshot:
+            return snapshot.intents()
 
-        Reservations are read for themselves, not by way of the intents that should own them.
-        """
+    @contextmanager
+    def snapshot(self) -> Iterator[Snapshot]:
+        """Read all of it, as of one moment."""
         with self._reading() as connection:
-            held = to_held(connection.execute(select(reservations)))
-            rows = connection.execute(select(flight_intents).order_by(flight_intents.c.sequence)).all()
-        owned = by_intent(held, np.unique(held.sequence).tolist(), self._airspace.grid)
-        intents = [to_intent(row, self._airspace, owned.pop(row.sequence, Reservations.none())) for row in rows]
-        return intents, owned
+            yield Snapshot(connection, self._airspace)
 
     def held_between(self, from_ms: int, to_ms: int, block: int) -> tuple[HeldReservations, dict[int, str]]:
         """Return a block's reservations that overlap [from, to), by enter, and the ids of their intents."""

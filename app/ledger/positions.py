@@ -27,6 +27,7 @@ from planner.airmatrix import AirMatrix
 
 # As the indices of these flights say it: SQLite compares conditions by their text.
 IS_OPEN = text("flight_intents.state IN ('accepted', 'activated', 'nonconforming', 'contingent')")
+IS_OVER = text("flight_intents.state IN ('cancelled', 'ended')")
 
 # Both databases understand this.
 _UPSERT = text(

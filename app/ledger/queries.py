@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, select, text
+from sqlalchemy import ColumnElement, Connection, Row, Select, select, text
 
 from app.flight_intents import FlightIntent, Reservations
 from app.ledger.rows import by_intent, to_held, to_intent
@@ -23,8 +23,8 @@ ACCEPTED = text("flight_intents.state = 'accepted'")
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """One line of the append-only journal: a flight intent's new state, what was remarked of an aircraft and why, or a
-    constraint's beginning or removal.
+    """One line of the append-only journal: a flight intent's new state, or that it is unmoved; what was remarked of an
+    aircraft and why; a constraint's beginning or removal.
 
     Entries of one revision happened at once; `place` orders them. `released` (n, 3): block, enter, exit of what the
     change took away. Tracks and constraints have sequence 0 and no intent id. `details` says more of some kinds.
@@ -138,18 +138,25 @@ def journal_after(connection: Connection, revision: int, limit: int | None) -> l
         last = rows[-1]
         rest = select(journal).where(entry.revision == last.revision, entry.place > last.place).order_by(entry.place)
         rows += connection.execute(rest)
-    return [
-        JournalEntry(
-            row.revision,
-            row.time,
-            row.kind,
-            row.flight_intent_id,
-            row.intent,
-            np.array(json.loads(row.released or "[]"), dtype=np.int64).reshape(-1, 3),
-            row.track_id,
-            tuple(json.loads(row.reasons or "[]")),
-            row.place,
-            json.loads(row.details or "{}"),
-        )
-        for row in rows
-    ]
+    return [_entry(row) for row in rows]
+
+
+def entries_of(connection: Connection, query: Select[Any]) -> list[JournalEntry]:
+    """Return the journal entries that a query asks for, oldest first."""
+    rows = connection.execute(query.order_by(journal.c.revision, journal.c.place))
+    return [_entry(row) for row in rows]
+
+
+def _entry(row: Row[Any]) -> JournalEntry:
+    return JournalEntry(
+        row.revision,
+        row.time,
+        row.kind,
+        row.flight_intent_id,
+        row.intent,
+        np.array(json.loads(row.released or "[]"), dtype=np.int64).reshape(-1, 3),
+        row.track_id,
+        tuple(json.loads(row.reasons or "[]")),
+        row.place,
+        json.loads(row.details or "{}"),
+    )

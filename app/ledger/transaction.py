@@ -16,7 +16,7 @@ import numpy as np
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, tuple_, update
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 
-from app.constraints import MOST_CONSTRAINTS, Constraint
+from app.constraints import MOST_CONSTRAINTS, UNMOVED, Constraint
 from app.errors import LedgerUnavailable, TooManyConstraints
 from app.flight_intents import OPEN_STATES, FlightIntent, HeldReservations, Refusal, Reservations, State, Submission
 from app.ledger import constraints as closed
@@ -96,7 +96,7 @@ class Transaction:
 
     @property
     def lowest_priority(self) -> int:
-        """A priority that no open flight's is below: a flight of no more than that displaces nobody."""
+        """A priority that no accepted flight's is below: a flight of no more than that displaces nobody."""
         return self._counters.lowest_priority
 
     @contextmanager
@@ -251,6 +251,13 @@ class Transaction:
         return np.array(list(self._connection.execute(query).scalars()), dtype=np.int64)
 
     @_asking()
+    def refresh_lowest_priority(self) -> None:
+        """Find out anew which priority no accepted flight's is below: the lowest ones may be over by now."""
+        self.flush()
+        lowest = self._connection.execute(select(func.min(flight_intents.c.priority)).where(queries.ACCEPTED)).scalar()
+        self._counters = replace(self._counters, lowest_priority=min(0, lowest or 0))
+
+    @_asking()
     def find_all(self, sequences: Iterable[int]) -> list[FlightIntent]:
         """Return intents with their reservations, by sequence."""
         self.flush()
@@ -335,6 +342,11 @@ class Transaction:
         self._append_constraint(constraint, now_ms, closed.REMOVED)
         return closed.remove(self._connection, constraint, now_ms)
 
+    def tell_unmoved(self, ids: Mapping[int, str], cause: Mapping[str, str], now_ms: int) -> None:
+        """Take down in the journal, of flights by sequence number, that they could not make way; nothing changes."""
+        for sequence, intent_id in ids.items():
+            self._append(sequence, intent_id, now_ms, UNMOVED, released=None, details={"cause": cause})
+
     @_asking()
     def constraint(self, constraint_id: str) -> Constraint | None:
         """Return a constraint, also one that has ended or was removed; None if there is none."""
@@ -358,13 +370,26 @@ class Transaction:
         return queries.find(self._connection, self._airspace, intent_id)
 
     @_asking()
-    def count_open(self, operator: str, limit: int) -> int:
-        """Return how many flights of an operator are not over; counted until there are so many."""
-        mine = select(flight_intents.c.sequence).where(flight_intents.c.operator == operator, positions.IS_OPEN)
-        mine = mine.limit(limit)
-        recorded = int(self._connection.execute(select(func.count()).select_from(mine.subquery())).scalar_one())
+    def count_open(self, operator: str, limit: int, now_ms: int) -> int:
+        """Return how many flights of an operator are not over, or still hold something; counted until there are so
+        many.
+        """
+        flight = flight_intents.c
+        mine = select(flight.sequence).where(flight.operator == operator)
+        # Where something was cut off, it ends with the next millisecond.
+        holds = (reservations.c.intent == flight.sequence) & (reservations.c.exit > now_ms + 1)
+        kept = (
+            flight.departure <= now_ms,
+            flight.arrival > now_ms,
+            flight.arrival <= now_ms + self._counters.longest_flight,
+            select(reservations.c.intent).where(holds).exists(),
+        )
+        found = 0
+        for some in (mine.where(positions.IS_OPEN), mine.where(positions.IS_OVER, *kept)):
+            count = select(func.count()).select_from(some.limit(limit).subquery())
+            found += int(self._connection.execute(count).scalar_one())
         new = self._new_intents.values()
-        return recorded + sum(each.submission.operator == operator and each.state in OPEN_STATES for each in new)
+        return found + sum(each.submission.operator == operator and each.state in OPEN_STATES for each in new)
 
     @_asking()
     def ids(self, sequences: Iterable[int]) -> dict[int, str]:

@@ -16,6 +16,7 @@ from sqlalchemy import (
     Text,
     and_,
     delete,
+    false,
     func,
     insert,
     or_,
@@ -113,14 +114,24 @@ class Waiting:
     attempts: int
 
 
+Lease = tuple[str, int]
+
+
 @dataclass(frozen=True)
 class Desk:
-    """Which process delivers and until when (ms), the journal's newest revision and up to which it was removed."""
+    """Which process delivers and until when by its own clock (ms; 0: it does no more), the journal's newest revision
+    and up to which it was removed.
+    """
 
     holder: str
     until_ms: int
     revision: int
     removed_through: int
+
+    @property
+    def lease(self) -> "Lease":
+        """Who has it until when."""
+        return self.holder, self.until_ms
 
 
 class WebhookRows:
@@ -177,14 +188,14 @@ class WebhookRows:
         ).one()
         return Desk(row.holder, row.until, row.revision, row.journal_removed)
 
-    def hold_desk(self, holder: str, now_ms: int, length_ms: int) -> bool:
-        """Take the desk or keep it for so long from now, and tell whether that was possible: nobody else has it.
-
-        A lease that ends later than any taken now would is from a clock that was ahead, and void.
+    def hold_desk(self, holder: str, until_ms: int, over: Lease | None = None) -> bool:
+        """Take the desk or keep it, and tell whether that was possible: it is the holder's, or was left, or nobody has
+        renewed a lease that is `over`.
         """
         desk = webhook_desk.c
-        is_free = or_(desk.holder == holder, desk.until <= now_ms, desk.until > now_ms + length_ms)
-        taken = update(webhook_desk).where(is_free).values(holder=holder, until=now_ms + length_ms)
+        is_over = false() if over is None else and_(desk.holder == over[0], desk.until == over[1])
+        is_free = or_(desk.holder == holder, desk.until == 0, is_over)
+        taken = update(webhook_desk).where(is_free).values(holder=holder, until=until_ms)
         return self._connection.execute(taken).rowcount == 1
 
     def leave_desk(self, holder: str) -> None:

@@ -25,7 +25,7 @@ from app.errors import (
     UnknownAircraftType,
 )
 from app.routes.answers import ChangedFlightIntentAnswer, outcome_body
-from app.routes.submissions import Finite, FlightIntentBody, PositionBody, located, spoken_for
+from app.routes.submissions import Finite, FlightIntentBody, located, spoken_for
 from app.service import Service, ServiceDep
 from planner.errors import NotPlannable
 from planner.together import Figures
@@ -36,11 +36,10 @@ _MOST_INTENTS = 500
 _LONGEST_S = 10.0
 
 
-class BatchBody(BaseModel):
+class BatchBody(problems.StrictBody):
     """Flight intents that nobody needs to be first among."""
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={
             "examples": [
                 {
@@ -75,15 +74,12 @@ class BatchBody(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _soon_refused(cls, body: object) -> object:
-        """Look at no more of a body than it takes to see that it is none."""
-        body = problems.with_one_unknown(body, cls)
+    def _few_enough(cls, body: object) -> object:
+        """Count flight intents before any of them is looked at."""
         items = body.get("flight_intents") if isinstance(body, dict) else None
-        if not isinstance(body, dict) or not isinstance(items, list):
-            return body
-        if len(items) > _MOST_INTENTS:
+        if isinstance(items, list) and len(items) > _MOST_INTENTS:
             raise ValueError(f"{len(items)} flight_intents; a batch may have up to {_MOST_INTENTS}")
-        return {**body, "flight_intents": [_with_few_unknown(item) for item in items]}
+        return body
 
     @model_validator(mode="after")
     def _of_equal_standing(self) -> "BatchBody":
@@ -95,14 +91,6 @@ class BatchBody(BaseModel):
                     "a batch has one"
                 )
         return self
-
-
-def _with_few_unknown(item: object) -> object:
-    item = problems.with_one_unknown(item, FlightIntentBody)
-    if not isinstance(item, dict):
-        return item
-    places = {name: item[name] for name in ("origin", "destination") if name in item}
-    return item | {name: problems.with_one_unknown(place, PositionBody) for name, place in places.items()}
 
 
 class FiguresBody(BaseModel):

@@ -30,19 +30,15 @@ Vertex = Annotated[list[Finite], Field(min_length=2, max_length=3, description="
 Rings = list[Annotated[list[Vertex], Field(min_length=4)]]
 
 
-class PolygonBody(BaseModel):
+class PolygonBody(problems.StrictBody):
     """A GeoJSON Polygon (RFC 7946): its outer ring, then its holes."""
-
-    model_config = ConfigDict(extra="forbid")
 
     type: Literal["Polygon"]
     coordinates: Annotated[Rings, Field(min_length=1)]
 
 
-class MultiPolygonBody(BaseModel):
+class MultiPolygonBody(problems.StrictBody):
     """A GeoJSON MultiPolygon (RFC 7946)."""
-
-    model_config = ConfigDict(extra="forbid")
 
     type: Literal["MultiPolygon"]
     coordinates: Annotated[list[Annotated[Rings, Field(min_length=1)]], Field(min_length=1)]
@@ -51,11 +47,10 @@ class MultiPolygonBody(BaseModel):
 Geometry = Annotated[PolygonBody | MultiPolygonBody, Field(discriminator="type")]
 
 
-class ConstraintBody(BaseModel):
+class ConstraintBody(problems.StrictBody):
     """A volume to be closed: a polygon, altitudes above the airspace's ground datum, and times."""
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={
             "examples": [
                 {
@@ -123,7 +118,7 @@ async def close(service: ServiceDep, body: ConstraintBody) -> Response:
 
     Accepted flights that hold some of them then are planned again at once, by priority and in order of arrival; what
     became of them is in `displaced`. Flights that have been activated, or depart within the notice, stay as they are:
-    `unmoved`. An aircraft in closed airspace makes its block red.
+    `unmoved`, which the journal says of each too. An aircraft in closed airspace makes its block red.
     """
     now_ms = service.clock()
     from_ms = now_ms if body.from_ is None else body.from_

@@ -17,9 +17,10 @@ router = APIRouter(prefix="/v1/events", tags=["events"])
 class Event(BaseModel):
     """One change of the ledger, in the order of the changes.
 
-    `kind` is a flight intent's new state; or how the aircraft of a flight intent or of a track conforms now, with the
-    reasons; or what became of a constraint. Events of one revision happened at once. Where a flight was planned again,
-    `details` tell the `cause`, by how much departure and arrival moved, and the reason if it was displaced.
+    `kind` is a flight intent's new state; `unmoved` where it keeps its state and its plan although a constraint closes
+    some of that; or how the aircraft of a flight intent or of a track conforms now, with the reasons; or what became of
+    a constraint. Events of one revision happened at once. Where a flight was planned again, `details` tell the `cause`,
+    by how much departure and arrival moved, and the reason if it was displaced; where it is unmoved, the `cause`.
     """
 
     revision: int

@@ -188,7 +188,9 @@ async def change(
     summary="Cancel a flight intent",
 )
 async def cancel(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
-    """Cancel an intent. Before departure its blocks are free at once; a departed flight keeps them until arrival."""
+    """Cancel an intent. Before departure its blocks are free at once; a departed flight keeps them until arrival, or
+    until it is reported on the ground (a position with `airborne: false`) and this request is repeated.
+    """
     return intent_response(service, await service.deconfliction.cancel(await _own(service, caller, intent_id)))
 
 
@@ -199,7 +201,9 @@ async def cancel(service: ServiceDep, caller: CallerDep, intent_id: str) -> Resp
     summary="Activate a flight intent",
 )
 async def activate(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
-    """Say that an accepted flight is about to depart; who flies without that is nonconforming."""
+    """Say that an accepted flight is about to depart; who flies without that is nonconforming. A service may refuse it
+    earlier than so long before departure: an activated flight makes way for nobody.
+    """
     return intent_response(service, await service.deconfliction.activate(await _own(service, caller, intent_id)))
 
 
@@ -211,7 +215,8 @@ async def activate(service: ServiceDep, caller: CallerDep, intent_id: str) -> Re
 )
 async def end(service: ServiceDep, caller: CallerDep, intent_id: str) -> Response:
     """Say that a flight is over. Its blocks are free at once if it has not departed or was reported on the ground; else
-    it keeps them until its arrival, for an aircraft does not vanish because a record did.
+    it keeps them until its arrival, for an aircraft does not vanish because a record did, or until it is reported on
+    the ground (a position with `airborne: false`) and this request is repeated.
     """
     return intent_response(service, await service.deconfliction.end(await _own(service, caller, intent_id)))
 

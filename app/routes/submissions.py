@@ -111,7 +111,8 @@ class TrajectoryEntryBody(BaseModel):
 class TrajectoryBody(IntentBody):
     """A trajectory of the operator's own, as answers give it, to be reserved as it is.
 
-    It departs at its first `arrive`; were it displaced later, it would be planned again until `latest_departure`.
+    It departs at its first `arrive`, and lasts an hour at most unless the server is set otherwise. Were it displaced
+    later, it would be planned again until `latest_departure`.
     """
 
     model_config = ConfigDict(
@@ -153,7 +154,9 @@ class VolumesBody(IntentBody):
     """4D volumes of the operator's own, as answers give `reservations`, to be reserved as they are.
 
     They must leave the aircraft a way from the origin to the destination. The flight departs when the first of them
-    begins, which is one of the origin's block, and arrives when the last ends, one of the destination's.
+    begins, which is one of the origin's block, and arrives when the last ends, one of the destination's: within an hour
+    unless the server is set otherwise. They hang together: each is reached from the origin's by way of others, every
+    one of them beside the one before (also across an edge or a corner) and overlapping it in time.
     """
 
     model_config = ConfigDict(
@@ -247,14 +250,16 @@ def _checked(service: Service, body: IntentBody) -> Submission:
     _check_aircraft_type(service, body)
     airspace = service.airspace
     performance = Performance.of(service.aircraft_types[body.aircraft_type], airspace.grid)
+    longest_ms = int(service.settings.path_limit_s * 1000)
     if isinstance(body, VolumesBody):
         ends = _ends(service, body.origin, body.destination)
         volumes = _columns((volume.block, volume.enter, volume.exit) for volume in body.volumes)
-        path = volumes_path(airspace, performance, ends.origin_block, ends.destination_block, *volumes)
+        ends_at = ends.origin_block, ends.destination_block
+        path = volumes_path(airspace, performance, *ends_at, *volumes, longest_ms=longest_ms)
     else:
         assert isinstance(body, TrajectoryBody)
         entries = _columns((entry.block, entry.arrive, entry.depart) for entry in body.trajectory)
-        path = trajectory_path(airspace, performance, *entries)
+        path = trajectory_path(airspace, performance, *entries, longest_ms=longest_ms)
         origin, destination = centres(airspace.grid, path.block[[0, -1]])
         ends = _Ends(origin, destination, int(path.block[0]), int(path.block[-1]))
         service.deconfliction.check(ends.origin_block, ends.destination_block)

@@ -31,6 +31,8 @@ from app.times import Timestamp
 router = APIRouter(prefix="/v1/telemetry", tags=["telemetry"])
 
 MAX_POSITIONS = 5_000
+# What counts as a request: the writer works for all of them.
+_POSITIONS_A_REQUEST = 500
 
 _EXAMPLE: JsonDict = {
     "track_id": "radar-17",
@@ -123,7 +125,7 @@ _JUMP = {"flag": "implausible-jump", "detail": "further from the last position t
     "",
     status_code=202,
     response_class=Response,
-    responses={202: {"model": TelemetryAnswer}, **problems.documented(400, 413, 422, 503)},
+    responses={202: {"model": TelemetryAnswer}, **problems.documented(400, 413, 422, 429, 503)},
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -139,10 +141,13 @@ async def report(service: ServiceDep, caller: CallerDep, request: Request) -> Re
     one by one. One that no aircraft can have reached from the last is taken, and flagged.
 
     Each refused position has its problem, by `index`, but of those that are no positions at all only the first hundred.
-    `problem_count` is how many were refused.
+    `problem_count` is how many were refused. Against an operator's rate every 500 positions, begun or full, count as a
+    request.
     """
     telemetry = service.telemetry
     read, unreadable = await to_thread.run_sync(_read, await request.body())
+    # One has been counted already.
+    service.access.overdraw(caller, max(0, len(read) + len(unreadable) - 1) // _POSITIONS_A_REQUEST)
     allowed = {kind: scope in caller.scopes for kind, scope in _SCOPE_FOR.items()}
     positions = [(index, position) for index, position in read if allowed[_kind(position)]]
     refused: dict[int, PositionRefused] = {

@@ -20,13 +20,12 @@ router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 Kind = Literal["intent", "conformance"]
 
 
-class WebhookBody(BaseModel):
-    """Where events of an operator's flight intents are to go: their new states (`intent`), and how their aircraft
-    conform (`conformance`).
+class WebhookBody(problems.StrictBody):
+    """Where events of an operator's flight intents are to go: their new states, and that they are unmoved by a
+    constraint (`intent`); and how their aircraft conform (`conformance`).
     """
 
     model_config = ConfigDict(
-        extra="forbid",
         json_schema_extra={
             "examples": [
                 {

@@ -292,6 +292,19 @@ def test_a_bad_answer_leaves_the_keys(publisher: Publisher, status: int, content
     assert known is not None
 
 
+@pytest.mark.parametrize("content", [b'{"keys": []}', b'{"keys": [{"kty": "OKP", "crv": "Ed25519", "kid": "new"}]}'])
+def test_an_issuer_that_has_no_usable_key_any_more_has_taken_back_all(publisher: Publisher, content: bytes) -> None:
+    monotonic = Monotonic()
+    store = KeyStore(publisher.url, 300, monotonic)
+    publisher.content, monotonic.now_s = content, 11
+    with capture_logs() as logged:
+        assert finds(store, "new") == finds(store, "first") == [None]
+    assert [entry["log_level"] for entry in logged] == ["error"]
+    # Until it has one again.
+    publisher.content, monotonic.now_s = key_set(SECOND).encode(), 22
+    assert None not in finds(store, "second")
+
+
 def test_no_address_has_a_user(publisher: Publisher) -> None:
     with pytest.raises(StartupError, match="give no user or password"):
         keys.store_of(Settings(jwks=publisher.url.replace("://", "://user:pw@")))

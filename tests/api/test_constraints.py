@@ -79,6 +79,13 @@ def test_a_constraint_is_made_and_read(lanes: Client, clock: FakeClock) -> None:
 
 
 @on_sqlite
+def test_of_members_that_nobody_knows_the_first_is_told(lanes: Client) -> None:
+    for known in ({}, {"from": format_time(START_MS)}):
+        answer = problem(lanes.post(CONSTRAINTS, json=body(colour="red", size=3) | known), 422, "validation-error")
+        assert [error["loc"] for error in answer["errors"]] == [["body", "colour"]]
+
+
+@on_sqlite
 def test_a_constraint_is_for_good_and_without_a_top_unless_told(lanes: Client) -> None:
     made = lanes.post(CONSTRAINTS, json=body()).json()
     assert (made["base_m"], made["top_m"], made["until"], made["blocks"]) == (0.0, None, None, 12)
@@ -302,6 +309,27 @@ def test_flights_in_its_way_are_planned_again_and_those_without_a_way_are_displa
     told_of = [event for event in events if event["revision"] == created["revision"]]
     assert [event["kind"] for event in told_of] == ["constraint_created", "displaced", "displaced"]
     assert {event["details"]["cause"]["constraint_id"] for event in told_of[1:]} == {rest["id"]}
+
+
+def test_of_each_flight_that_can_no_longer_move_the_journal_says_so_with_the_constraint(lanes: Client) -> None:
+    stays, moves = activated(lanes), submit(lanes, "V", "F", earliest_ms=DEPARTURE_MS + 600_000)
+    before = lanes.get(f"{SUBMIT}/{stays}").json()
+    look(lanes)
+    with streaming(lanes) as stream:
+        stream.news()
+        made = close(lanes, area(2.1, -1, 4.9, 9))
+        look(lanes)
+        streamed = [each for each in stream.news() if each.data.get("kind") == "unmoved"]
+    assert made["unmoved"] == [stays]
+    created, displaced, unmoved = lanes.get("/v1/events").json()["items"][-3:]
+    assert (created["kind"], displaced["flight_intent_id"]) == ("constraint_created", moves)
+    told_of = {name: unmoved[name] for name in ("revision", "kind", "flight_intent_id", "sequence", "details")}
+    assert told_of == {
+        "revision": created["revision"], "kind": "unmoved", "flight_intent_id": stays, "sequence": 1,
+        "details": {"cause": {"constraint_id": made["id"]}},
+    }  # fmt: skip
+    assert [(each.name, each.data) for each in streamed] == [("intent", unmoved)]
+    assert lanes.get(f"{SUBMIT}/{stays}").json() == before
 
 
 @on_sqlite

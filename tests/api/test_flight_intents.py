@@ -218,6 +218,18 @@ def test_an_aircraft_without_the_endurance_is_refused(
             assert (answer["reason"], answer["conflicting_intents"]) == ("endurance_exceeded", [])
 
 
+@on_sqlite
+def test_of_those_in_the_way_a_refusal_names_a_hundred(street: Client) -> None:
+    flights = [street.post(SUBMIT, json=along(window_ms=400_000)).json() for _ in range(102)]
+    window_ms = parse_time(flights[-1]["departure"]) - DEPARTURE_MS
+    refusal = problem(street.post(SUBMIT, json=along(window_ms=window_ms)), 409, "no-conflict-free-plan")
+    named = set(refusal["conflicting_intents"])
+    assert len(named) == len(refusal["conflicting_intents"]) == 100
+    assert named < {flight["id"] for flight in flights}
+    read = street.get(f"{SUBMIT}/{refusal['flight_intent_id']}").json()
+    assert read["refusal"]["conflicting_intents"] == refusal["conflicting_intents"]
+
+
 def test_a_refusal_is_recorded_with_its_reasons_and_reserves_nothing(street: Client) -> None:
     first = street.post(SUBMIT, json=along()).json()
     refusal = street.post(SUBMIT, json=along(window_ms=0)).json()

@@ -10,6 +10,7 @@ import pytest
 from app.errors import TooManyRequests
 from app.limits import RateLimit
 from app.main import create_app
+from app.times import parse_time
 from tests.api.bodies import PREVIEW, SUBMIT, intent, problem
 from tests.api.serving import Client, served, serving, settings_for
 from tests.api.tokens import as_, issuer, write_keys
@@ -98,6 +99,18 @@ def test_a_batch_counts_as_its_flight_intents(ledger: str, tmp_path: Path, clock
         assert response.headers["retry-after"] == "40"
 
 
+@pytest.mark.parametrize(("positions", "requests"), [(0, 1), (1, 1), (500, 1), (501, 2), (1_001, 3)])
+def test_a_report_counts_once_for_every_500_positions(
+    ledger: str, tmp_path: Path, clock: FakeClock, positions: int, requests: int
+) -> None:
+    with limited(ledger, tmp_path, clock, rate_per_s=1, rate_burst=4) as api:
+        # What cannot be read counts too.
+        reports = [{"positions": [None] * positions}, *[{"positions": []}] * (4 - requests)]
+        answers = [api.post("/v1/telemetry", json=report, **as_()) for report in (*reports, {"positions": []})]
+        assert [answer.status_code for answer in answers] == [202] * (5 - requests) + [429]
+        problem(api.post(SUBMIT, json=intent(), **as_()), 429, "too-many-requests")
+
+
 def test_who_asks_too_often_is_told_when_to_come_back(ledger: str, tmp_path: Path, clock: FakeClock) -> None:
     with limited(ledger, tmp_path, clock, rate_per_s=0.1, rate_burst=2) as api:
         first = api.post(SUBMIT, json=intent(), **as_())
@@ -150,6 +163,24 @@ def test_an_operator_has_so_many_open_flight_intents_at_most(ledger: str, tmp_pa
         assert api.post(SUBMIT, json=later(3, "blue-kite"), **as_("blue-kite")).status_code == 201
         assert api.delete(first.headers["location"], **as_()).status_code == 200
         assert api.post(SUBMIT, json=later(2), **as_()).status_code == 201
+
+
+@pytest.mark.parametrize("way", ["cancelled", "ended"])
+def test_a_flight_that_is_over_counts_while_it_holds_something(
+    ledger: str, tmp_path: Path, clock: FakeClock, way: str
+) -> None:
+    with limited(ledger, tmp_path, clock, open_intents_limit=2) as api:
+        # One that was cancelled before its departure holds nothing then.
+        assert api.delete(api.post(SUBMIT, json=later(0), **as_()).headers["location"], **as_()).status_code == 200
+        flights = [api.post(SUBMIT, json=later(number), **as_()) for number in (0, 1)]
+        place = flights[0].headers["location"]
+        clock.now_ms = DEPARTURE_MS + 1
+        over = api.delete(place, **as_()) if way == "cancelled" else api.post(f"{place}/end", **as_())
+        assert (over.json()["state"], bool(over.json()["reservations"])) == (way, True)
+        problem(api.post(SUBMIT, json=later(2), **as_()), 429, "too-many-open-intents")
+        clock.now_ms = parse_time(over.json()["trajectory"][-1]["depart"])
+        assert api.post(SUBMIT, json=later(2), **as_()).status_code == 201
+        problem(api.post(SUBMIT, json=later(3), **as_()), 429, "too-many-open-intents")
 
 
 def test_an_answer_is_repeated_at_the_limit_too(ledger: str, tmp_path: Path, clock: FakeClock) -> None:

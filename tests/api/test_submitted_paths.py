@@ -11,10 +11,12 @@ import pytest
 from app.flight_intents import FlightIntent, Refusal
 from app.ledger import Ledger
 from app.main import create_app
+from app.settings import Settings
 from app.times import format_time, parse_time
 from planner.separation import CheckedFlight, verify
 from tests.api.bodies import PREVIEW, SUBMIT, intent, problem
 from tests.api.serving import Client, served
+from tests.api.test_running import settings_with
 from tests.ledger.district import AIRCRAFT, DEPARTURE_MS, LANES, START_MS
 from tests.ledger.locations import on_sqlite
 from tests.ledger.process import FakeClock
@@ -172,12 +174,15 @@ def to_and_fro(entries: int) -> list[dict[str, Any]]:
 
 
 @on_sqlite
-def test_a_path_may_have_five_thousand_entries_written_as_generously_as_answers_are(lanes: Client) -> None:
+def test_a_path_may_have_five_thousand_entries_written_as_generously_as_answers_are(
+    on_lanes: Settings, clock: FakeClock
+) -> None:
     body = own(to_and_fro(5_000))
     assert len(json.dumps(body)) > 700_000
-    first = lanes.post(SUBMIT, json=body)
-    assert (first.status_code, len(first.json()["trajectory"])) == (201, 5_000)
-    preview = lanes.post(PREVIEW, json=own(first.json()["trajectory"]))
+    with served(create_app(settings_with(on_lanes, path_limit_s=86_400), clock, elapsed_ms=clock)) as lanes:
+        first = lanes.post(SUBMIT, json=body)
+        assert (first.status_code, len(first.json()["trajectory"])) == (201, 5_000)
+        preview = lanes.post(PREVIEW, json=own(first.json()["trajectory"]))
     assert problem(preview, 409, "path-conflicts")["conflict_count"] == len(first.json()["reservations"])
 
 
@@ -243,8 +248,41 @@ def test_a_path_that_cannot_be_flown_is_refused_for_its_first_wrong_entry_and_no
     refusal = problem(lanes.post(SUBMIT, json=own(trajectory)), 422, "path-refused")
     assert (refusal["reason"], refusal["entry"]) == ("not_a_chain", 3)
     held = planned(lanes)["reservations"]
-    refusal = problem(lanes.post(SUBMIT, json=volumes([held[0], held[-1]])), 422, "path-refused")
+    refusal = problem(lanes.post(SUBMIT, json=volumes(held[:-1])), 422, "path-refused")
     assert (refusal["reason"], refusal["entry"]) == ("not_flyable", None)
+    assert lanes.get(SUBMIT).json()["items"] == []
+
+
+@on_sqlite
+def test_a_path_lasts_an_hour_at_most(lanes: Client) -> None:
+    trajectory = planned(lanes)["trajectory"]
+    begins_ms, lands = parse_time(trajectory[0]["arrive"]), trajectory[-1]
+    ends = [format_time(begins_ms + 3_600_000 + beyond_ms) for beyond_ms in (0, 1)]
+    too_long = problem(
+        lanes.post(SUBMIT, json=own([*trajectory[:-1], {**lands, "depart": ends[1]}])), 422, "path-refused"
+    )
+    assert (too_long["reason"], too_long["entry"]) == ("too_long", len(trajectory) - 1)
+    assert "more than 3600 s" in too_long["detail"]
+    held = [{**one, "enter": trajectory[0]["arrive"], "exit": ends[0]} for one in planned(lanes)["reservations"]]
+    too_long = problem(lanes.post(SUBMIT, json=volumes([*held, {**held[-1], "exit": ends[1]}])), 422, "path-refused")
+    assert (too_long["reason"], too_long["entry"]) == ("too_long", len(held))
+    assert lanes.post(PREVIEW, json=volumes(held)).status_code == 200
+    assert accepted(lanes, own([*trajectory[:-1], {**lands, "depart": ends[0]}]))["arrival"] == ends[0]
+
+
+@on_sqlite
+def test_how_long_a_path_lasts_is_a_setting(on_lanes: Settings, clock: FakeClock) -> None:
+    with served(create_app(settings_with(on_lanes, path_limit_s=10), clock, elapsed_ms=clock)) as lanes:
+        refusal = problem(lanes.post(SUBMIT, json=own(planned(lanes)["trajectory"])), 422, "path-refused")
+    assert (refusal["reason"], "more than 10 s" in refusal["detail"]) == ("too_long", True)
+
+
+@on_sqlite
+def test_volumes_that_the_flight_does_not_come_to_are_refused_for_the_first_of_them(lanes: Client) -> None:
+    held = planned(lanes)["reservations"]
+    far = [{**held[0], "block": list(LANES.airspace.grid.block(LANES.block(sign)))} for sign in "VF"]
+    refusal = problem(lanes.post(SUBMIT, json=volumes([*held, *far])), 422, "path-refused")
+    assert (refusal["reason"], refusal["entry"]) == ("out_of_reach", len(held))
     assert lanes.get(SUBMIT).json()["items"] == []
 
 

@@ -222,6 +222,38 @@ def test_a_flight_activated_in_the_air_is_activated_as_soon_as_it_is_seen_to_con
     assert state_of(street, flight) == "activated"
 
 
+def test_a_flight_is_activated_no_earlier_before_its_departure_than_is_allowed(
+    on_street: Settings, clock: FakeClock
+) -> None:
+    with served(create_app(settings_with(on_street, activation_lead_s=30), clock, elapsed_ms=clock)) as client:
+        flight = submit(client)["id"]
+        clock.now_ms = DEPARTURE_MS - 30_001
+        refusal = problem(client.post(f"{SUBMIT}/{flight}/activate"), 409, "illegal-transition")
+        assert f"may be activated from {format_time(DEPARTURE_MS - 30_000)} on" in refusal["detail"]
+        assert kinds(client) == ["accepted"]
+        clock.now_ms += 1
+        assert client.post(f"{SUBMIT}/{flight}/activate").json()["state"] == "activated"
+
+
+@pytest.mark.parametrize(("later_ms", "state"), [(20_000, "activated"), (20_001, "accepted"), (600_000, "accepted")])
+def test_an_activated_flight_that_is_put_off_for_longer_than_allowed_is_accepted_again(
+    on_street: Settings, clock: FakeClock, later_ms: int, state: str
+) -> None:
+    with served(create_app(settings_with(on_street, activation_lead_s=30), clock, elapsed_ms=clock)) as client:
+        flight = submit(client)["id"]
+        clock.now_ms = DEPARTURE_MS - 10_000
+        assert client.post(f"{SUBMIT}/{flight}/activate").status_code == 200
+        later = intent("W", "E", district=STREET, earliest_ms=DEPARTURE_MS + later_ms)
+        changed = client.request("PUT", f"{SUBMIT}/{flight}", json=later, headers={"If-Match": "*"}).json()
+        assert (changed["state"], state_of(client, flight), kinds(client)[-1]) == (state, state, state)
+        # It makes way again, and is activated when it is due.
+        above = submit(client, "E", "W", earliest_ms=DEPARTURE_MS + later_ms, window_ms=0, priority=1)
+        made_way = [each["flight_intent_id"] for each in above.get("displaced", [])]
+        assert made_way == ([flight] if later_ms == 600_000 else [])
+        clock.now_ms = parse_time(client.get(f"{SUBMIT}/{flight}").json()["trajectory"][0]["depart"])
+        assert client.post(f"{SUBMIT}/{flight}/activate").json()["state"] == "activated"
+
+
 # What ending a flight frees
 
 
@@ -294,6 +326,42 @@ def test_a_process_that_starts_later_knows_what_was_freed(
     with second_process(on_street, clock) as other:
         assert against(other, clock)["delay_s"] == 0.0
     assert_no_overlaps(on_street.ledger)
+
+
+@pytest.mark.parametrize("action", ["end", "cancel"])
+def test_what_a_flight_kept_that_is_over_goes_when_it_is_down_and_the_request_is_repeated(
+    street: Client, on_street: Settings, clock: FakeClock, action: str
+) -> None:
+    with second_process(on_street, clock) as other:
+        flight = submit(street)
+        clock.now_ms = DEPARTURE_MS
+        see(street, flight["id"], clock.now_ms)
+        kept = attempt(street, flight["id"], action).json()
+        clock.now_ms = MIDWAY_MS
+        assert attempt(other, flight["id"], action).json() == kept
+        see(other, flight["id"], clock.now_ms, (2, 0, 0), airborne=False)
+        freed = attempt(street, flight["id"], action).json()
+        passed = [hold for hold in flight["reservations"] if parse_time(hold["enter"]) <= MIDWAY_MS]
+        end = format_time(MIDWAY_MS + 1)
+        assert freed["reservations"] == [{**hold, "exit": min(hold["exit"], end)} for hold in passed]
+        assert (freed["state"], int(freed["version"])) == (kept["state"], int(kept["version"]) + 1)
+        assert attempt(other, flight["id"], action).json() == freed
+        assert kinds(street) == ["accepted", kept["state"], kept["state"]]
+        assert against(other, clock)["delay_s"] == 0.0
+        assert "departure" not in against(street, clock)
+    assert_no_overlaps(on_street.ledger)
+
+
+@on_sqlite
+@pytest.mark.parametrize("action", ["end", "cancel"])
+def test_after_its_arrival_nothing_is_left_to_free(street: Client, clock: FakeClock, action: str) -> None:
+    flight = submit(street)
+    clock.now_ms = ARRIVAL_MS
+    kept = attempt(street, flight["id"], action).json()
+    clock.now_ms = ARRIVAL_MS + 1000
+    see(street, flight["id"], clock.now_ms, (7, 0, 0), airborne=False)
+    assert attempt(street, flight["id"], action).json() == kept
+    assert len(kinds(street)) == 2
 
 
 @on_sqlite

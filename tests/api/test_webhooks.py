@@ -30,6 +30,7 @@ from app.webhooks import Destinations, retry_after_ms
 from tests.api.bodies import SUBMIT, problem
 from tests.api.receiving import Event, Receiver, receiving
 from tests.api.serving import Client, served, settings_for
+from tests.api.test_constraints import area, close
 from tests.api.tokens import as_, issuer, write_keys
 from tests.api.watching import activated, look, see, submit
 from tests.ledger.district import DEPARTURE_MS, LANES, START_MS
@@ -153,6 +154,17 @@ def test_a_webhook_is_told_what_it_asked_for_from_then_on_and_nothing_of_others(
     ]
 
 
+def test_an_operator_is_told_that_a_flight_cannot_make_way_for_a_constraint(still: Client, receiver: Receiver) -> None:
+    flight = activated(still, "V", "F")
+    subscribe(still, receiver.url, "intent")
+    made = close(still, area(2.1, -1, 4.9, 9))
+    deliver(deliverer(still))
+    (delivery,) = receiver.deliveries
+    assert made["unmoved"] == [flight]
+    assert (delivery.event["flight_intent_id"], delivery.event["kind"]) == (flight, "unmoved")
+    assert delivery.event["details"] == {"cause": {"constraint_id": made["id"]}}
+
+
 @pytest.mark.parametrize("status", [500, 302, None])
 def test_what_is_not_taken_is_sent_again_later_and_later(
     still: Client, receiver: Receiver, clock: FakeClock, status: int | None
@@ -173,8 +185,10 @@ def test_what_is_not_taken_is_sent_again_later_and_later(
     assert webhook["last_error"] == ("no answer within 0.05 s" if status is None else f"answered {status}")
     assert webhook["failing_since"] == webhook["created"]
     receiver.verdict = lambda _: 200
+    successor = deliverer(still)
+    deliver(successor)
     clock.advance(seconds=DESK_S)
-    deliver(deliverer(still))
+    deliver(successor)
     assert len({delivery.parsed["id"] for delivery in receiver.deliveries}) == 1
     webhook = the_webhook(still)
     assert (webhook["pending"], webhook["failing_since"], webhook["given_up"]) == (0, None, 0)
@@ -352,6 +366,35 @@ def test_two_processes_deliver_each_event_once(
             still.post(f"{SUBMIT}/{flight}/end")
         deliver(*pair)
     assert sorted(receiver.told) == [(n, kind) for n in (1, 2, 3, 4) for kind in ("accepted", "activated", "ended")]
+
+
+@pytest.mark.parametrize("ahead_ms", [-3_600_000, -30_000, -100, 100, 30_000, 3_600_000])
+def test_two_processes_whose_clocks_differ_deliver_each_event_once(
+    still: Client, on_lanes: Settings, clock: FakeClock, receiver: Receiver, ahead_ms: int
+) -> None:
+    with served(create_app(on_lanes, lambda: clock() + ahead_ms, elapsed_ms=clock)) as other:
+        assert other.service.writing is not None
+        other.service.writing.deliverer.stop()
+        subscribe(still, receiver.url)
+        first, second = deliverer(still), deliverer(other)
+        flight = submit(still)
+        deliver(second, first)
+        # What the first sends takes a while, and it has renewed its lease before it ends.
+        for step in ("activate", "end"):
+            clock.advance(seconds=DESK_S / 2 + 1)
+            still.post(f"{SUBMIT}/{flight}/{step}")
+            deliver(first, second)
+        holders = {mail for mail in (first, second) if mail._is_ours()}
+        assert len(holders) == 1
+        # Where it dies, the other one takes over.
+        (dead,) = holders
+        successor = second if dead is first else first
+        submit(still, earliest_ms=DEPARTURE_MS + 600_000)
+        deliver(successor)
+        assert len(receiver.deliveries) == 3
+        clock.advance(seconds=DESK_S)
+        deliver(successor)
+    assert receiver.kinds == ["accepted", "activated", "ended", "accepted"]
 
 
 def test_a_process_that_stops_leaves_the_desk_to_the_next(lanes: Client, receiver: Receiver) -> None:

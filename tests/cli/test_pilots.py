@@ -18,6 +18,7 @@ from app.client import Client, ServiceUnreachable, UnexpectedAnswer
 from app.commands import pilots as pilots_module
 from app.commands.deviations import Deviations, Flown, Kind
 from app.commands.pilots import Dispatch, Pilots, Report, ServiceTime
+from app.constraints import UNMOVED
 from app.flight_intents import State
 from app.routes.answers import FlightIntentAnswer
 from app.times import ServerClock, format_time, parse_time
@@ -82,12 +83,12 @@ class StandIn:
         """The journal's newest revision."""
         return max((entry["revision"] for entry in self.journal), default=0)
 
-    def tell(self, kind: State, *answers: FlightIntentAnswer, is_new_plan: bool = False) -> None:
+    def tell(self, kind: str, *answers: FlightIntentAnswer, is_new_plan: bool = False) -> None:
         """Write to the journal, all in one revision."""
         revision, at = self.revision + 1, format_time(self.clock())
-        details = {"cause": {"constraint_id": "closed"}, "reason": None} if is_new_plan else {}
+        details = {"cause": {"constraint_id": "closed"}, "reason": None} if is_new_plan or kind == UNMOVED else {}
         self.journal += [
-            {"revision": revision, "time": at, "kind": kind.value, "flight_intent_id": answer.id,
+            {"revision": revision, "time": at, "kind": kind, "flight_intent_id": answer.id,
              "sequence": answer.sequence, "track_id": None, "reasons": [], "details": details}
             for answer in answers
         ]  # fmt: skip
@@ -319,6 +320,22 @@ def test_a_flight_in_the_air_goes_where_it_is_sent_now() -> None:
     assert y[0] == pytest.approx(30, abs=0.01)
     assert y[-1] == pytest.approx(70, abs=0.01)
     assert service.asked == []
+
+
+def test_a_flight_that_cannot_make_way_flies_on_and_is_not_asked_for() -> None:
+    asked: list[str] = []
+    service = StandIn(
+        [intent(1, -1, state=State.ACTIVATED)], rate=20, on_request=lambda request: asked.append(request.url.path)
+    )
+
+    def until(pilots: Pilots) -> bool:
+        if not service.journal and service.reports:
+            service.tell(UNMOVED, service.intents[0])
+        return pilots.unfinished == 0
+
+    assert fly(service, until=until).arrived == 1
+    assert "/v1/events" in asked
+    assert "/v1/flight-intents/flight-1" not in asked
 
 
 def test_of_events_of_one_revision_none_is_missed_where_reading_fails_among_them() -> None:

@@ -1,8 +1,6 @@
 """`airmatrix verify`: finds what is wrong with a ledger, names it, and changes nothing."""
 
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,6 +10,7 @@ from tests.cli.conftest import History, Run
 from tests.cli.serving import Server
 from tests.cli.town import LINK_MS
 from tests.ledger.locations import HEAD
+from tests.ledger.tampering import tampering
 
 SUMMARY = {
     "flight intents": "8 accepted, 1 rejected, 2 cancelled",
@@ -20,17 +19,9 @@ SUMMARY = {
     "separation violations": "0",
     "building violations": "0",
     "containment violations": "0",
+    "constraint violations": "0",
     "closest building": "12.000 m, hall",
 }
-
-
-@contextmanager
-def tampering(ledger: Path) -> Iterator[sqlite3.Connection]:
-    """Open a ledger without the triggers that guard it."""
-    with closing(sqlite3.connect(ledger)) as connection, connection:
-        for (trigger,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
-            connection.execute(f"DROP TRIGGER {trigger}")
-        yield connection
 
 
 def test_a_ledger_with_every_kind_of_intent_is_found_in_order(
@@ -66,6 +57,47 @@ def test_a_ledger_can_be_verified_while_it_is_served(airmatrix: Run, town: Serve
     options = ("--flights", 5, "--operator", "meanwhile", "--url", town.url)
     assert airmatrix("simulate", *options).status == 0
     assert airmatrix("verify", "--ledger", town.ledger, "--airspace", town_file).status == 0
+
+
+def close_row_five(book: sqlite3.Connection, revision: int, created_ms: int) -> None:
+    """Have a constraint over the fifth column of blocks from a time on, recorded with a revision."""
+    book.execute(
+        "INSERT INTO constraints (number, id, name, polygon, blocks, base_m, begins, created) "
+        "VALUES (1, 'c-1', 'a parade', '{}', '[5, 15, 25]', 0, ?, ?)",
+        (created_ms, created_ms),
+    )
+    book.execute(
+        "INSERT INTO journal (revision, place, time, kind, intent, flight_intent_id, details) "
+        "VALUES (?, 0, ?, 'constraint_created', 0, '', '{\"constraint_id\": \"c-1\"}')",
+        (revision, created_ms),
+    )
+
+
+def test_flights_in_airspace_that_was_closed_before_they_were_planned_are_named(
+    airmatrix: Run, history: History, ledger: Path, town_file: Path
+) -> None:
+    first = history.rows[0]
+    with tampering(ledger) as book:
+        close_row_five(book, 0, (first.departure or 0) - 3_600_000)
+    outcome = airmatrix("verify", "--ledger", ledger, "--airspace", town_file)
+    assert outcome.status == 1
+    assert outcome.table["constraint violations"] == "3"
+    # It enters a millisecond before the fifth link is over.
+    held = next(hold for hold in first.reservations if hold.block == (5, 0, 0))
+    assert (
+        f"violation: reservation in closed airspace ({first.id}), block [5, 0, 0], {format_time(held.enter)} to "
+        f"{format_time(held.exit)}: it was planned after the constraint, c-1 (a parade)"
+    ) in outcome.err.splitlines()
+    assert not any(history.rows[3].id in line for line in outcome.err.splitlines())
+
+
+def test_flights_in_airspace_that_was_closed_later_may_have_been_too_late_to_make_way(
+    airmatrix: Run, history: History, ledger: Path, town_file: Path
+) -> None:
+    with tampering(ledger) as book:
+        close_row_five(book, 1_000, (history.rows[0].departure or 0) - 3_600_000)
+    outcome = airmatrix("verify", "--ledger", ledger, "--airspace", town_file)
+    assert (outcome.status, outcome.table["constraint violations"]) == (0, "0")
 
 
 def test_overlapping_reservations_are_named(airmatrix: Run, history: History, ledger: Path, town_file: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from app.airspace_closing import AirspaceClosing, Closed
+from app.errors import TooManyConstraints
 from app.flight_intents import FlightIntent, State
 from app.scheduling import FEW, Foreseen, Scheduler
 from planner.path import Plan
@@ -84,6 +85,19 @@ def test_who_was_planned_ahead_is_moved_there(street: Process, meanwhile: Meanwh
     [foreseen] = found
     assert [flight.state for flight in closed.displaced] == [State.ACCEPTED] * FLIGHTS
     assert departures(street) == {n: plan_of(known).departure_ms - DEPARTURE_MS for n, known in foreseen.items()}
+    assert_sound(street)
+
+
+def test_all_constraints_together_close_no_more_blocks_than_there_is_room_for(
+    street: Process, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.airspace_closing.MOST_CLOSED_BLOCKS", 2)
+    for _ in range(2):
+        close(street)
+    before = [described(flight) for flight in everything(street).values()]
+    with pytest.raises(TooManyConstraints, match="may close 2 blocks"):
+        close(street)
+    assert [described(flight) for flight in everything(street).values()] == before
     assert_sound(street)
 
 

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, State
 from app.surveillance import Aircraft, Remark, Sighting
+from tests.ledger.commits import commit_and_fail, fail, on_next_commit
 from tests.ledger.district import SQUARE, START_MS, STREET
 from tests.ledger.locations import database
 from tests.ledger.process import (
@@ -17,6 +19,9 @@ from tests.ledger.process import (
     Process,
     assert_gapless,
     assert_no_overlaps,
+    assert_sound,
+    departure,
+    held,
     reserved,
     until,
 )
@@ -174,3 +179,36 @@ def test_a_flight_that_ends_in_the_millisecond_in_which_it_departs_keeps_what_it
     clock.now_ms = flight.trajectory.departure_ms
     assert len(end(one, flight).reservations) == len(flight.reservations)
     assert one.indexed(clock.now_ms) == reserved(one.location, clock.now_ms)
+
+
+def kept_and_down(process: Process, clock: FakeClock) -> FlightIntent:
+    """Return a flight that was ended in the air, and whose aircraft was seen on the ground since."""
+    intent = process.submit(SQUARE.submission("N", "S"))
+    clock.now_ms = departure(intent)
+    kept = end(process, intent)
+    assert held(kept) == held(intent)
+    clock.advance(seconds=1)
+    see(process, Aircraft(intent.sequence), clock.now_ms, airborne=False)
+    return kept
+
+
+def test_what_was_freed_later_by_a_commit_that_was_lost_is_answered_from_the_ledger(
+    square: Process, clock: FakeClock
+) -> None:
+    kept = kept_and_down(square, clock)
+    with on_next_commit(commit_and_fail):
+        freed = end(square, kept)
+    assert (freed.state, freed.version) == (State.ENDED, kept.version + 1)
+    assert max(freed.reservations.exit_ms) == clock.now_ms + 1
+    assert_sound(square)
+
+
+def test_what_a_commit_that_failed_should_have_freed_is_still_held(square: Process, clock: FakeClock) -> None:
+    kept = kept_and_down(square, clock)
+    with on_next_commit(fail), pytest.raises(LedgerUnavailable, match="nothing was recorded"):
+        end(square, kept)
+    found = square.ledger.find(kept.id)
+    assert found is not None
+    assert (found.version, held(found)) == (kept.version, held(kept))
+    assert end(square, kept).version == kept.version + 1
+    assert_sound(square)

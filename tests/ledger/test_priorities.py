@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,14 @@ from structlog.testing import capture_logs
 
 from app.batches import BatchOutcome
 from app.commands.verify import checked
-from app.constraints import Constraint
+from app.constraints import UNMOVED, Constraint
 from app.deconfliction import Outcome
 from app.errors import IllegalTransition, LedgerUnavailable, OutcomeUnknown, PreconditionFailed, RequestError
 from app.flight_intents import Displacement, FlightIntent, State, Submission
 from app.ledger import JournalEntry
 from app.replica import OccupancyReplica
 from app.scheduling import Limits
+from app.trespasses import trespasses
 from planner.aircraft import shipped_aircraft_types
 from planner.cfa_star import Performance, Planner, PlanRequest
 from planner.errors import Block, NoPlan, PlannerError
@@ -43,6 +45,7 @@ from tests.ledger.process import (
     content,
     held,
     reserved,
+    until,
 )
 
 YARD = district(".....\n..#..\n.....", ".....\n.....\n.....")
@@ -204,7 +207,7 @@ class World:
         stay = [flight for flight in hit if flight.sequence not in movable]
         assert set(outcome.unmoved) == {flight.id for flight in stay}
         self.stayed |= {(constraint.number, flight.sequence) for flight in stay}
-        self.judge(before, revision, constraint, outcome.displaced)
+        self.judge(before, revision, constraint, outcome.displaced, outcome.unmoved)
         self.in_force[constraint.number] = constraint
         self.constraints.append(constraint)
 
@@ -268,7 +271,12 @@ class World:
         assert [described(flight) for flight in after.values()] == [described(flight) for flight in before.values()]
 
     def judge(
-        self, before: Flights, revision: int, cause: FlightIntent | Constraint, displaced: Sequence[Displacement]
+        self,
+        before: Flights,
+        revision: int,
+        cause: FlightIntent | Constraint,
+        displaced: Sequence[Displacement],
+        unmoved: Sequence[str] = (),
     ) -> None:
         """Compare what has changed with what was answered, what the journal says, and who may be moved."""
         now_ms = self.clock.now_ms
@@ -276,6 +284,10 @@ class World:
         entry, *entries = self.process.ledger.journal_after(revision, 1_000)
         assert {each.revision for each in (entry, *entries)} == {revision + 1}
         assert [each.place for each in (entry, *entries)] == list(range(1 + len(entries)))
+        entries, told_last = entries[: len(displaced)], entries[len(displaced) :]
+        assert [(told.intent_id, told.kind, told.details) for told in told_last] == [
+            (id_, UNMOVED, {"cause": {"constraint_id": cause.id}}) for id_ in unmoved
+        ]
         own = cause.sequence if isinstance(cause, FlightIntent) else 0
         below = cause.submission.priority if isinstance(cause, FlightIntent) else None
         assert entry.sequence == own
@@ -336,6 +348,8 @@ class World:
         flights = everything(self.process)
         flown = [checked(flight) for flight in flights.values() if flight.trajectory is not None]
         assert verify(YARD.airspace, flown).violations == ()
+        with self.process.ledger.snapshot() as snapshot:
+            assert trespasses(snapshot, snapshot.intents()[0]) == []
         inside = {
             (number, flight.sequence)
             for number, constraint in self.in_force.items()
@@ -451,6 +465,7 @@ def departures(process: Process) -> dict[int, int | None]:
     }
 
 
+HOUR_MS = 3_600_000
 # How long a flight holds the first block, and with it the street: no shorter distance keeps two apart.
 HOLD_MS = 2 * 1668 + 1
 # How long after a flight one can set off from the other end.
@@ -730,6 +745,32 @@ def test_a_constraint_whose_commit_was_lost_is_in_force(street: Process) -> None
     assert [flight.id for flight in closed.displaced] == [first.id]
     assert commits == []
     assert_sound(street)
+
+
+def test_nobody_pays_for_low_priorities_that_are_over(street: Process, clock: FakeClock) -> None:
+    def is_lowest(priority: int) -> bool:
+        with street.ledger.transaction() as transaction:
+            return transaction.lowest_priority == priority
+
+    low, lower = (
+        submitted(street, along(priority, earliest_ms=DEPARTURE_MS + HOUR_MS)).intent for priority in (-2, -5)
+    )
+    assert is_lowest(-5)
+    for left, flight in ((-2, lower), (0, low)):
+        clock.advance(seconds=61)
+        street.cancel(flight)
+        asyncio.run(until(partial(is_lowest, left)))
+
+
+@pytest.mark.parametrize("row", [0, 2])
+def test_whoever_can_fly_without_delay_moves_nobody(ledgers: Ledgers, clock: FakeClock, row: int) -> None:
+    """Around the building there are two ways, one as short as the other."""
+    with Process(ledgers.migrated(), YARD.airspace, clock) as process:
+        submitted(process, YARD.submission((0, row, 0), (4, row, 0)))
+        urgent = submitted(process, replace(YARD.submission((0, 1, 0), (4, 1, 0)), priority=1))
+        assert urgent.displaced == ()
+        assert urgent.intent.trajectory is not None
+        assert urgent.intent.trajectory.flight_time_ms == urgent.intent.trajectory.unconstrained_ms
 
 
 def test_who_changes_to_a_lower_priority_makes_way(street: Process) -> None:

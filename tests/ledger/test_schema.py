@@ -21,6 +21,7 @@ INDICES = {
     "flight_intents_by_end",
     "flight_intents_open",
     "flight_intents_open_by_operator",
+    "flight_intents_over_by_operator",
     "flight_intents_movable",
     "reservations_by_intent",
     "idempotency_keys_by_age",

@@ -16,7 +16,6 @@ from tests.ledger.test_migrations import migrated_to
 T = TypeVar("T")
 
 NOW = 1_000_000
-LEASE_MS = 20_000
 ACME = Webhook("one", "acme-air", "https://acme.example/", "secret", ("intent",), NOW, read_through=0)
 ENTRY = "INSERT INTO journal (revision, place, time, kind, intent, flight_intent_id) VALUES (?, ?, ?, ?, ?, '')"
 
@@ -101,23 +100,31 @@ def test_what_failed_is_due_at_its_time_and_the_webhook_fails_until_then(opened:
 
 
 @pytest.mark.parametrize(
-    ("holder", "now", "held"),
-    [("a", NOW + 1, True), ("b", NOW + LEASE_MS - 1, False), ("b", NOW + LEASE_MS, True), ("b", NOW - 1, True)],
-    ids=["kept", "taken", "run out", "of a clock that was ahead"],
+    ("holder", "over", "held"),
+    [
+        ("a", None, True),
+        ("b", None, False),
+        ("b", ("a", NOW - 1), False),
+        ("b", ("c", NOW), False),
+        ("b", ("a", NOW), True),
+    ],
+    ids=["kept", "taken", "renewed since", "taken since", "run out"],
 )
-def test_one_holder_has_the_desk_until_its_time_is_over(opened: Ledger, holder: str, now: int, held: bool) -> None:
-    assert write(opened, lambda rows: rows.hold_desk("a", NOW, LEASE_MS))
-    assert write(opened, lambda rows: rows.hold_desk(holder, now, LEASE_MS)) is held
+def test_one_holder_has_the_desk_until_its_lease_is_over(
+    opened: Ledger, holder: str, over: tuple[str, int] | None, held: bool
+) -> None:
+    assert write(opened, lambda rows: rows.hold_desk("a", NOW))
+    assert write(opened, lambda rows: rows.hold_desk(holder, NOW + 1, over)) is held
     desk = read(opened, lambda rows: rows.desk())
-    assert (desk.holder, desk.until_ms) == ((holder, now + LEASE_MS) if held else ("a", NOW + LEASE_MS))
+    assert desk.lease == ((holder, NOW + 1) if held else ("a", NOW))
 
 
 def test_a_desk_that_was_left_is_free(opened: Ledger) -> None:
-    write(opened, lambda rows: rows.hold_desk("a", NOW, LEASE_MS))
+    write(opened, lambda rows: rows.hold_desk("a", NOW))
     write(opened, lambda rows: rows.leave_desk("b"))
-    assert not write(opened, lambda rows: rows.hold_desk("b", NOW, LEASE_MS))
+    assert not write(opened, lambda rows: rows.hold_desk("b", NOW))
     write(opened, lambda rows: rows.leave_desk("a"))
-    assert write(opened, lambda rows: rows.hold_desk("b", NOW, LEASE_MS))
+    assert write(opened, lambda rows: rows.hold_desk("b", NOW))
 
 
 def test_the_journal_is_read_in_whole_revisions(opened: Ledger, ledger: str) -> None:

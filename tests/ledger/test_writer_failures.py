@@ -2,11 +2,11 @@
 
 import asyncio
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Never
+from typing import Any, Never
 from urllib.parse import urlsplit
 
 import pytest
@@ -14,14 +14,27 @@ import structlog
 from sqlalchemy import Connection, Engine, event
 from sqlalchemy.exc import OperationalError
 
+from app.batches import BatchKey
 from app.deconfliction import IdempotencyKey, Outcome
 from app.errors import LedgerUnavailable, OutcomeUnknown
 from app.flight_intents import State, Submission
 from app.ledger import open_ledger
+from app.writer import BatchReport
 from tests.ledger.commits import commit_and_fail, fail, on_commit, on_next_commit, unwritable
 from tests.ledger.district import DEPARTURE_MS, SQUARE, STREET
 from tests.ledger.locations import database, on_postgresql, on_sqlite
-from tests.ledger.process import POLICY, FakeClock, Process, assert_sound, departure, held, outcomes, reserved, until
+from tests.ledger.process import (
+    POLICY,
+    FakeClock,
+    Process,
+    assert_sound,
+    departure,
+    held,
+    key,
+    outcomes,
+    reserved,
+    until,
+)
 
 
 def test_requests_whose_commit_failed_are_told_that_nothing_was_recorded(square: Process) -> None:
@@ -72,10 +85,37 @@ def test_a_commit_whose_fate_nobody_can_tell_is_answered_as_unknown(ledger: str,
     policy = replace(POLICY, look_up_ms=200)
     with Process(ledger, SQUARE.airspace, clock, policy=policy) as process:
         with on_commit(commit_and_fail), pytest.raises(OutcomeUnknown, match="repeat the request with the same"):
-            process.submit(SQUARE.submission("N", "S"))
+            process.submit(SQUARE.submission("N", "S"), key("once"))
         # It was there after all.
         assert process.submit(SQUARE.submission("N", "S")).sequence == 2
         assert_sound(process)
+
+
+@pytest.mark.parametrize("what", ["submit", "change", "cancel"])
+def test_without_a_key_nobody_is_told_to_ask_again_before_they_have_looked(
+    ledger: str, clock: FakeClock, what: str
+) -> None:
+    policy = replace(POLICY, look_up_ms=200)
+    request = SQUARE.submission("N", "S")
+    with Process(ledger, SQUARE.airspace, clock, policy=policy) as process:
+        flight = process.submit(request)
+        asks: dict[str, Callable[[], Coroutine[Any, Any, object]]] = {
+            "submit": lambda: process.deconfliction.submit(request),
+            "change": lambda: process.deconfliction.change(flight.id, request, None),
+            "cancel": lambda: process.deconfliction.cancel(flight.id),
+        }
+        with on_commit(commit_and_fail), pytest.raises(OutcomeUnknown, match="read first what there is") as unknown:
+            asyncio.run(asks[what]())
+    assert "Key" not in str(unknown.value)
+
+
+@pytest.mark.parametrize("name", [None, "once"])
+def test_a_batch_can_be_repeated_where_it_has_a_key(ledger: str, clock: FakeClock, name: str | None) -> None:
+    reports: list[BatchReport] = []
+    with Process(ledger, SQUARE.airspace, clock, observers=[reports.append]) as process:
+        named = None if name is None else BatchKey(name, "digest")
+        asyncio.run(process.batches.submit([SQUARE.submission("N", "S")], 0, named, lambda: False))
+    assert {request.has_key for report in reports for request in report.requests} == {name is not None}
 
 
 @on_sqlite

@@ -117,6 +117,18 @@ def test_a_copy_goes_its_own_way() -> None:
     assert contents(copy) == [Held(1, 0, 5, -1), Held(1, 5, 9, 1), Held(1, 9, 20, -1), Held(2, 0, 10, 2)]
 
 
+def test_a_copy_of_some_time_has_what_overlaps_that() -> None:
+    index = OccupancyIndex(BLOCKS)
+    index.reserve(*columns((0, 0, 10), (0, 10, 20), (0, 20, 30), (0, 30, 40)), np.array([1, 2, 3, 4]))
+    index.close({1: Closure(*columns((1, 0, 10), (1, 12, 15), (2, 30, 40)))})
+    copy = index.without(np.array([3], dtype=np.int64), 10, 30)
+    assert contents(copy) == [Held(0, 10, 20, 2), Held(1, 12, 15, -1)]
+    assert len(copy) == 1
+    # There is room for more.
+    copy.reserve(*columns(*((0, 100 + n, 101 + n) for n in range(20))), 5)
+    assert len(copy) == 21
+
+
 def test_closures_that_need_more_room_than_there_is_make_some() -> None:
     index = OccupancyIndex(1)
     count = 3 * len(index.slabs.pool)

@@ -428,6 +428,7 @@ PLAZA = drawn("..... A.B.. .....", ".....\n.....\n.....")
         (None, [((3, 2, 1), 0, 9), ((4, 2, 1), 8, 12)]),
         (3, [((4, 1, 0), 0, 40)]),
         (4, [((3, 2, 1), 0, 9), ((4, 2, 1), 9, 12)]),
+        (4, [((3, 2, 1), 9, 12), ((4, 2, 1), 0, 9)]),
         # Two beside each other, and nobody comes to either; the first of them is named.
         (3, [((4, 0, 0), 0, 40), ((4, 1, 0), 0, 40)]),
         # Of one block, what touches is one volume; what does not is another.
