@@ -25,6 +25,11 @@ export function post(path, body) {
   });
 }
 
+/** Return the JSON of the answer to a DELETE. Throws `RequestFailed`. */
+export function remove(path) {
+  return request(path, { method: "DELETE" });
+}
+
 /** Return the open response of the event stream, resumed after an id. Throws `RequestFailed`. */
 export function openStream(lastId, signal) {
   return answer("/v1/airspace/stream", {

@@ -7,6 +7,7 @@ import { palette } from "/console/palette.js";
 const STATUSES = ["red", "yellow", "green"];
 const OPACITY = { red: 0.72, yellow: 0.6, green: 0.34 };
 const CLOSED = "closed";
+const DRAFT = "draft";
 const HATCH_PX = 32;
 /** Tiles this deep are precise to decimetres, and so few that thousands of blocks are cut up in no time. */
 const DEEPEST_TILE = 14;
@@ -68,6 +69,9 @@ export class CityMap {
     }
     this.#setImage(CLOSED, stripes(colours.red));
     map.setPaintProperty("closed-edge", "line-color", colours.red);
+    this.#setImage(DRAFT, stripes(colours.accent));
+    map.setPaintProperty("draft-corners", "circle-color", colours.accent);
+    map.setPaintProperty("draft-corners", "circle-stroke-color", colours.outline);
   }
 
   /** Show these blocks, entries of a status answer. */
@@ -89,7 +93,7 @@ export class CityMap {
 
   /** Show closed airspace: constraints, up to the ceiling where they have no top. */
   showConstraints(constraints) {
-    const ceiling = this.#grid.dimensions[2] * this.#grid.height;
+    const { ceiling } = this.#grid;
     this.#map.getSource(CLOSED).setData({
       type: "FeatureCollection",
       features: constraints.map(({ name, polygon, base_m: base, top_m: top }) => ({
@@ -98,6 +102,20 @@ export class CityMap {
         geometry: polygon,
       })),
     });
+  }
+
+  /** Show an area that may be closed: its corners, and hatched what they enclose, null for nothing. */
+  showDraft(corners, polygon, base, top) {
+    const features = corners.map((coordinates) => ({
+      type: "Feature", properties: {}, geometry: { type: "Point", coordinates },
+    }));
+    if (polygon) features.push({ type: "Feature", properties: { base, top }, geometry: polygon });
+    this.#map.getSource(DRAFT).setData({ type: "FeatureCollection", features });
+  }
+
+  /** Return how many pixels of the canvas lie between two positions on the ground, `[lon, lat]`. */
+  pixelsBetween(one, other) {
+    return this.#map.project(one).dist(this.#map.project(other));
   }
 
   /** Return the names of the constraints at a point of the canvas. */
@@ -172,6 +190,8 @@ export class CityMap {
         buildings: shapes(buildings, 15),
         blocks: shapes(empty),
         [CLOSED]: shapes(empty),
+        // Corners are to be where they were set, however close the camera is.
+        [DRAFT]: shapes(empty, 20),
       },
       layers: [
         { id: "outside", type: "background" },
@@ -214,6 +234,20 @@ export class CityMap {
             "fill-extrusion-opacity": 0.45,
             "fill-extrusion-vertical-gradient": false,
           },
+        },
+        {
+          id: DRAFT, type: "fill-extrusion", source: DRAFT, filter: ["==", ["geometry-type"], "Polygon"],
+          paint: {
+            "fill-extrusion-pattern": DRAFT,
+            "fill-extrusion-base": ["get", "base"],
+            "fill-extrusion-height": ["get", "top"],
+            "fill-extrusion-opacity": 0.5,
+            "fill-extrusion-vertical-gradient": false,
+          },
+        },
+        {
+          id: "draft-corners", type: "circle", source: DRAFT, filter: ["==", ["geometry-type"], "Point"],
+          paint: { "circle-radius": 5, "circle-stroke-width": 1.5 },
         },
       ],
     };

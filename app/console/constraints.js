@@ -2,7 +2,7 @@
 
 import { get } from "/console/api.js";
 import { element, navigable, setText, showList } from "/console/dom.js";
-import { clockTime, relative } from "/console/time.js";
+import { moment, relative } from "/console/time.js";
 
 /** As many as there may be. */
 const MOST = 500;
@@ -62,11 +62,13 @@ export class ConstraintsPanel {
   }
 }
 
-function altitudes({ base_m: base, top_m: top }) {
+/** Return a constraint's altitudes in words. */
+export function altitudes({ base_m: base, top_m: top }) {
   return top === null ? `from ${Math.round(base)} m up` : `${Math.round(base)}–${Math.round(top)} m`;
 }
 
-function times({ from, until }, timeMs) {
+/** Return when a constraint begins or ends, in words, as seen from a time. */
+export function times({ from, until }, timeMs) {
   if (timeMs < Date.parse(from)) return `closes ${relative(Date.parse(from), timeMs)}`;
-  return until === null ? "for good" : `until ${clockTime(Date.parse(until))} UTC`;
+  return until === null ? "for good" : `until ${moment(Date.parse(until), timeMs)}`;
 }

@@ -13,6 +13,11 @@ export class Grid {
     this.#lattice = airspace.lattice;
   }
 
+  /** Where the highest layer ends, in metres. */
+  get ceiling() {
+    return this.dimensions[2] * this.height;
+  }
+
   /** Return longitude and latitude of a point of the grid, in block sides east and north of its south-west corner. */
   position(east, north) {
     const across = quadratic(east / this.dimensions[0]);

@@ -3,6 +3,7 @@
 import { AlertsPanel } from "/console/alerts.js";
 import { aborted, get } from "/console/api.js";
 import { CityMap, HEAT_RAMP } from "/console/city_map.js";
+import { Closing } from "/console/closing.js";
 import { ConstraintsPanel, constraintsAt, isInForce, middleOf } from "/console/constraints.js";
 import { Details } from "/console/details.js";
 import { byId, element, navigable, setText, statusChip } from "/console/dom.js";
@@ -14,7 +15,8 @@ import { NewFlight } from "/console/new_flight.js";
 import { palette } from "/console/palette.js";
 import { Picture } from "/console/picture.js";
 import { aircraftAt, blocksAt } from "/console/planned.js";
-import { startSession } from "/console/session.js";
+import { Reopening } from "/console/reopening.js";
+import { scopes, startSession } from "/console/session.js";
 import { listenToKeys } from "/console/shortcuts.js";
 import { follow } from "/console/stream.js";
 import { symbolCanvas } from "/console/symbols.js";
@@ -25,12 +27,15 @@ import { showAirspace, showCounts, showFailure, showLink } from "/console/top_ba
 import { Traffic } from "/console/traffic.js";
 import { CONFORMANCE_WORDS, STATUS_WORDS, flightName, journalWords } from "/console/words.js";
 
-const TABS = ["alerts", "flights", "details", "new"];
+const TABS = ["alerts", "flights", "details", "new", "airspace"];
+const CLOSES = "airmatrix.admin";
 const WIDE_PX = 1200;
 const FRAME_MS = 33;
 const REFRESH_MS = 500;
 const HEAT_MS = 10_000;
 const NOTICE_MS = 8_000;
+/** So near, in pixels, a click means a corner that is there. */
+const SAME_CORNER_PX = 10;
 
 class Console {
   #picture = new Picture();
@@ -43,11 +48,14 @@ class Console {
   #flights;
   #details;
   #newFlight;
+  #closing;
+  #reopening;
   #constraintsPanel;
   /** The constraints in force and to come, and the ids of those on the map. */
   #constraints = [];
   #constraintsRequest = null;
   #closed = "";
+  #drawnArea = "null";
   /** `{kind: "flight" | "track", id}`, `{kind: "block", block}` or null. */
   #selection = null;
   /** `{blocks, counts, flying, constraints}` of a moment other than the present; null while live. */
@@ -139,9 +147,21 @@ class Console {
     this.#newFlight = new NewFlight(this.#grid, {
       choose,
       now,
-      pick: (end) => this.#showPicking(end),
+      pick: (end) => this.#pickEnd(end),
       showEnds: (ends) => this.#traffic.showEnds(ends),
       showPath: (intent, preview) => this.#traffic.showPath(intent.trajectory, intent.reservations, { preview }),
+    });
+    this.#closing = new Closing(this.#grid, {
+      choose,
+      now,
+      draw: (hint) => this.#drawArea(hint),
+      show: (area) => this.#showArea(area),
+      closed: () => this.#loadConstraints(),
+      name: (id) => this.#names.get(id) ?? null,
+    });
+    this.#reopening = new Reopening({
+      find: (constraint) => this.#city.flyTo(middleOf(constraint)),
+      reopened: () => this.#loadConstraints(),
     });
   }
 
@@ -228,6 +248,8 @@ class Console {
     else if (this.#picture.now !== null) showCounts(this.#picture.counts, flying.length);
     this.#timeline.refresh();
     this.#details.refresh();
+    this.#closing.refresh();
+    byId("closing-access").hidden = scopes()?.includes(CLOSES) ?? true;
     this.#showConstraints();
   }
 
@@ -248,6 +270,7 @@ class Console {
     if (time === null) return;
     const constraints = this.#moment?.constraints ?? this.#constraints;
     this.#constraintsPanel.show(constraints, time);
+    this.#reopening.show(this.#constraints, this.#picture.now);
     const inForce = constraints.filter((constraint) => isInForce(constraint, time));
     const closed = inForce.map(({ id }) => id).join();
     if (closed !== this.#closed) this.#city.showConstraints(inForce);
@@ -353,12 +376,40 @@ class Console {
     if (place) this.#city.flyTo(place);
   }
 
-  #showPicking(end) {
-    byId("map").classList.toggle("picking", end !== null);
-    byId("crosshair").hidden = end === null;
-    byId("picking").hidden = end === null;
-    if (end === null) return;
-    setText(byId("picking"), `Click the ${end} on the map, or press Enter to take the centre. Esc ends this.`);
+  #pickEnd(end) {
+    if (end !== null && this.#closing.isDrawing) this.#closing.abandon();
+    this.#showPicking(end && `Click the ${end} on the map, or press Enter to take the centre. Esc ends this.`);
+  }
+
+  #drawArea(hint) {
+    const { map } = this.#city;
+    if (hint !== null && byId("picking").hidden) map.getCanvas().focus();
+    if (hint !== null && this.#newFlight.picking !== null) this.#newFlight.pick(null);
+    // The second click of two that end an outline must not zoom; it comes at once after what ended it.
+    if (hint === null) setTimeout(() => map.doubleClickZoom.enable());
+    else map.doubleClickZoom.disable();
+    this.#showPicking(hint);
+  }
+
+  /** Show what is being chosen on the map; null: nothing is. */
+  #showPicking(hint) {
+    byId("map").classList.toggle("picking", hint !== null);
+    byId("crosshair").hidden = hint === null;
+    byId("picking").hidden = hint === null;
+    if (hint !== null) setText(byId("picking"), hint);
+  }
+
+  #showArea(area) {
+    this.#traffic.showArea(area);
+    const drawn = JSON.stringify(area && { ...area, end: null });
+    // The city is dear to draw: not for every move of the pointer.
+    if (drawn === this.#drawnArea) return;
+    this.#drawnArea = drawn;
+    this.#city.showDraft(area?.corners ?? [], area?.polygon ?? null, area?.base, area?.top);
+  }
+
+  #placeCorner({ lng, lat }) {
+    this.#closing.place(lng, lat, (corner) => this.#city.pixelsBetween(corner, [lng, lat]) < SAME_CORNER_PX);
   }
 
   #listenToMap() {
@@ -368,13 +419,18 @@ class Console {
         this.#newFlight.place(lngLat.lng, lngLat.lat);
         return;
       }
+      if (this.#closing.isDrawing) {
+        this.#placeCorner(lngLat);
+        return;
+      }
       const flight = this.#traffic.at(point);
       const block = this.#city.blockAtPoint(point) ?? this.#grid.blockAt(lngLat.lng, lngLat.lat, 0);
       if (flight) this.#choose({ kind: flight.track_id ? "track" : "flight", id: idOf(flight) });
       else this.#choose(block === null ? null : { kind: "block", block });
     });
-    map.on("mousemove", ({ point }) => {
-      const flight = this.#newFlight.picking === null ? this.#traffic.at(point) : null;
+    map.on("mousemove", ({ point, lngLat }) => {
+      if (this.#closing.isDrawing) this.#closing.point([lngLat.lng, lngLat.lat]);
+      const flight = this.#isPicking ? null : this.#traffic.at(point);
       this.#traffic.hovered = flight ? idOf(flight) : null;
       map.getCanvas().style.cursor = flight ? "pointer" : "";
       map.getCanvas().title = this.#closed ? this.#city.constraintsAtPoint(point).join(", ") : "";
@@ -387,6 +443,8 @@ class Console {
       ["2", "Flights", () => this.#focusTab("flights")],
       ["3", "Details", () => this.#focusTab("details")],
       ["4", "New flight", () => this.#focusTab("new")],
+      ["5", "Airspace: what is closed", () => this.#focusTab("airspace")],
+      ["C", "Close airspace", () => this.#closeAirspace()],
       ["/", "Find a flight", () => {
         this.#openTab("flights");
         byId("flights-search").focus();
@@ -398,22 +456,44 @@ class Console {
       ["F", "Whole airspace", () => this.#city.goHome()],
       ["M", "Move the focus to the map", () => this.#city.map.getCanvas().focus()],
       ["T", "Dark or light", toggleTheme],
+      ["Backspace", "While an area is drawn: take back the last corner", () => this.#takeBack()],
     ], {
-      escape: () => (this.#newFlight.picking === null ? this.#choose(null) : this.#newFlight.pick(null)),
+      escape: () => this.#escape(),
       enter: () => this.#pickCentre(),
     });
   }
 
+  get #isPicking() {
+    return this.#newFlight.picking !== null || this.#closing.isDrawing;
+  }
+
   #pickCentre() {
-    if (this.#newFlight.picking === null) return false;
-    const { lng, lat } = this.#city.map.getCenter();
-    this.#newFlight.place(lng, lat);
+    if (!this.#isPicking) return false;
+    const centre = this.#city.map.getCenter();
+    if (this.#closing.isDrawing) this.#placeCorner(centre);
+    else this.#newFlight.place(centre.lng, centre.lat);
     return true;
+  }
+
+  #escape() {
+    if (this.#closing.isDrawing) this.#closing.abandon();
+    else if (this.#newFlight.picking !== null) this.#newFlight.pick(null);
+    else this.#choose(null);
+  }
+
+  #takeBack() {
+    if (this.#closing.isDrawing) this.#closing.undo();
+  }
+
+  #closeAirspace() {
+    this.#openTab("airspace");
+    this.#closing.open();
   }
 
   #focusTab(tab) {
     this.#openTab(tab);
-    (byId(tab).querySelector("button, input") ?? byId(`tab-${tab}`)).focus();
+    const fields = [...byId(tab).querySelectorAll("button, input")];
+    (fields.find((field) => field.checkVisibility()) ?? byId(`tab-${tab}`)).focus();
   }
 }
 

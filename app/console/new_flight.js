@@ -2,9 +2,9 @@
 
 import { get, post } from "/console/api.js";
 import { byId, element, facts, setText } from "/console/dom.js";
+import { failure, unsent } from "/console/outcome.js";
 import { token } from "/console/session.js";
 import { clockTime, relative, span } from "/console/time.js";
-import { explained } from "/console/words.js";
 
 const ENDS = ["origin", "destination"];
 
@@ -77,7 +77,7 @@ export class NewFlight {
     const outcome = byId("new-outcome");
     const missing = this.#missing();
     if (missing) {
-      outcome.replaceChildren(element("p", { class: "outcome bad", text: missing }));
+      outcome.replaceChildren(unsent(missing));
       return;
     }
     const earliest = this.#actions.now() + Number(byId("new-departure").value) * 60_000;
@@ -130,11 +130,8 @@ export class NewFlight {
   }
 
   #refused(error) {
-    const { headline, explanation, detail } = explained(error);
     const problem = error.problem ?? {};
-    const box = element("div", { class: "outcome bad" },
-      element("strong", { text: headline }), element("p", { text: explanation }),
-      detail ? element("p", { class: "hint", text: detail }) : null);
+    const box = failure(error);
     const end = { origin_blocked: "origin", destination_blocked: "destination" }[problem.reason];
     if (end && problem.nearest_free_block) {
       box.append(element("button", {

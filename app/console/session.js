@@ -10,6 +10,17 @@ let asking = null;
 /** Return the token, or null. */
 export const token = () => sessionStorage.getItem(KEY);
 
+/** Return the scopes that the token names; null where nothing can be said of them. What counts the service decides. */
+export function scopes() {
+  try {
+    const claims = JSON.parse(atob(token().split(".")[1].replaceAll("-", "+").replaceAll("_", "/")));
+    const given = claims.scope ?? claims.scp ?? claims.scopes ?? "";
+    return Array.isArray(given) ? given : given.split(" ");
+  } catch {
+    return null;
+  }
+}
+
 /** Show the button to sign out where there is something to forget. */
 export function startSession() {
   byId("sign-out").addEventListener("click", signOut);

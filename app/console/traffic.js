@@ -33,6 +33,7 @@ export class Traffic {
   #block = null;
   #alarms = [];
   #ends = { origin: null, destination: null };
+  #area = null;
 
   constructor(map, frame, grid, colours, tags) {
     this.#map = map;
@@ -90,6 +91,12 @@ export class Traffic {
     this.#drawStill();
   }
 
+  /** Draw the edges of an area, `{corners, base, top, end}`, `end` the next corner to be or null; null removes it. */
+  showArea(area) {
+    this.#area = area;
+    this.#drawStill();
+  }
+
   /** Return the flight or track drawn nearest to a point of the canvas, null where none is. */
   at({ x, y }) {
     const near = this.#drawn
@@ -141,6 +148,7 @@ export class Traffic {
       ...this.#pathLines(),
       ...Object.entries(this.#ends).flatMap(([end, position]) =>
         position === null ? [] : [this.#pole(this.#frame.local(position), { colour: rgba(colours[end]), width: 3 })]),
+      ...(this.#area === null ? [] : this.#areaLines(this.#area)),
       ...(this.#block === null ? [] : this.#box(this.#block, rgba(colours.accent), 3)),
     ]);
     this.draw();
@@ -154,6 +162,23 @@ export class Traffic {
       ...points.slice(1).map((to, index) => ({ from: points[index], to, colour, width: 4, dash })),
       ...[points.at(0), points.at(-1)].filter(Boolean).map((end) => this.#pole(end, { colour, width: 2, dash: 3 })),
     ];
+  }
+
+  /** Return an area's edges: its outline low and high, a pole at each corner; dashed where it is not drawn yet. */
+  #areaLines({ corners, base, top, end }) {
+    const colour = rgba(this.#colours.accent);
+    const all = end === null ? corners : [...corners, end];
+    const foot = all.map(([lon, lat]) => this.#frame.local({ lon, lat, alt_m: base }));
+    const raised = ([x, y]) => [x, y, top];
+    return foot.flatMap((from, index) => {
+      const to = foot[(index + 1) % foot.length];
+      const dash = end !== null && index >= corners.length - 1 ? 5 : 0;
+      return [
+        { from, to, colour, width: 2.5, dash },
+        { from: raised(from), to: raised(to), colour, width: 1.2, dash },
+        { from, to: raised(from), colour, width: 1.2, dash },
+      ];
+    });
   }
 
   /** Return a line from the ground to a point. */

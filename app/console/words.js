@@ -60,6 +60,7 @@ const REFUSALS = {
   disconnected: "Buildings leave no way from the origin to the destination, whatever the traffic.",
   no_departure_slot: "Within the departure window the origin's block is never free for long enough.",
   no_conflict_free_path: "Within the departure window other flights and closed airspace leave no way through.",
+  search_too_long: "No way was found with the work that one flight may take: ask for a shorter window, or a later one.",
   endurance_exceeded: "A way exists, but it takes longer than this aircraft can stay in the air.",
 };
 
@@ -67,6 +68,7 @@ const PROBLEMS = {
   "departure-in-the-past": "The departure window has passed. Choose a later departure.",
   "beyond-horizon": "The departure lies further ahead than the service plans. Choose an earlier one.",
   "aircraft-too-slow": "This aircraft is too slow for the airspace. Choose another.",
+  "insufficient-scope": "Your token does not allow this. Sign out, and in again with one that does.",
   "queue-full": "Too many requests are waiting. Try again in a second.",
   "ledger-unavailable": "The ledger is unavailable and nothing was recorded. Try again later.",
   "outcome-unknown": "It is not known whether this was recorded. Look into the list of flights before you repeat it.",
@@ -79,14 +81,14 @@ export const blockReason = (slug) => BLOCK_REASONS[slug] ?? slug.replaceAll("_",
 /** Return what a reason says of a flight. */
 export const flightReason = (slug) => FLIGHT_REASONS[slug] ?? slug.replaceAll("_", " ");
 
-/** Return a refusal or another failed request as `{headline, explanation, detail}`. */
-export function explained(failure) {
+/** Return a refusal or another failed request as `{headline, explanation, detail}`; `words` go before ours, by slug. */
+export function explained(failure, words = {}) {
   const problem = failure.problem;
   if (problem === null) {
     return { headline: "No answer", explanation: `Nothing is known: ${failure.message}.`, detail: "" };
   }
   const slug = String(problem.type).split("/").pop();
-  const explanation = REFUSALS[problem.reason] ?? PROBLEMS[slug] ?? problem.detail;
+  const explanation = REFUSALS[problem.reason] ?? words[slug] ?? PROBLEMS[slug] ?? problem.detail;
   return {
     headline: REFUSALS[problem.reason] ? "Refused" : problem.title,
     explanation,
@@ -119,8 +121,16 @@ export function journalWords(entry) {
 
 /** Return what became of a flight: its state or, where it was planned again and still flies, how. */
 function became({ kind, details }) {
+  if (kind === "unmoved") return "can no longer make way";
   if (kind === "displaced" || details.cause === undefined) return kind;
   if (details.cause === null) return "changed";
-  const moved = details.arrival_moved_s;
-  return `made way, arrives ${Math.abs(moved).toFixed(1)} s ${moved < 0 ? "sooner" : "later"}`;
+  return `made way, ${arrivalWords(details.arrival_moved_s)}`;
 }
+
+/** Return how much a flight that was planned again arrives sooner or later. */
+export function arrivalWords(seconds) {
+  return `arrives ${Math.abs(seconds).toFixed(1)} s ${seconds < 0 ? "sooner" : "later"}`;
+}
+
+/** Return why there is no plan for a flight, or any more. */
+export const refusalWords = (reason) => REFUSALS[reason] ?? reason.replaceAll("_", " ");

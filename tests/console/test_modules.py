@@ -228,6 +228,7 @@ def test_the_journal_says_of_a_flight_that_was_planned_again_what_became_of_it(m
             ("accepted", {"cause": cause, "arrival_moved_s": 4.26}),
             ("accepted", {"cause": cause, "arrival_moved_s": -1.0}),
             ("displaced", {"cause": cause, "arrival_moved_s": None}),
+            ("unmoved", {"cause": {"constraint_id": "y"}}),
         ]
     ]
     told = modules.run(
@@ -243,4 +244,5 @@ def test_the_journal_says_of_a_flight_that_was_planned_again_what_became_of_it(m
         "#7 made way, arrives 4.3 s later",
         "#7 made way, arrives 1.0 s sooner",
         "#7 displaced",
+        "#7 can no longer make way",
     ]
