@@ -41,6 +41,7 @@ class _Picture:
     """What will be reserved and closed without the flights that have to make way, and their sequence numbers."""
 
     now: int
+    revision: int
     index: OccupancyIndex
     movable: tuple[int, ...]
 
@@ -71,11 +72,7 @@ class AirspaceClosing:
         ------
         TooManyConstraints, QueueFull, LedgerUnavailable, OutcomeUnknown
         """
-        async with self._turn:
-            picture = await self._writer.perform(
-                lambda transaction, now: self._picture(transaction, now, constraint), lambda: None
-            )
-            foreseen = {} if picture is None else await to_thread.run_sync(self._foresee, picture)
+        foreseen = await self._foreseen(constraint)
         # What the last attempt did, which is what was done if the constraint is in the ledger.
         done: list[Closed] = []
 
@@ -87,6 +84,21 @@ class AirspaceClosing:
             return done[0] if done and self._ledger.constraint(constraint.id) is not None else None
 
         return await self._writer.perform(run, look_up)
+
+    async def _foreseen(self, constraint: Constraint) -> Mapping[int, Foreseen]:
+        """Plan those ahead who will have to make way, if they are many; return nothing where they are few."""
+
+        async def look() -> _Picture | None:
+            return await self._writer.perform(
+                lambda transaction, now: self._picture(transaction, now, constraint), lambda: None
+            )
+
+        if await look() is None:
+            return {}
+        async with self._turn:
+            # Anew, for another one may just have moved them.
+            picture = await look()
+            return {} if picture is None else await to_thread.run_sync(self._foresee, picture)
 
     async def reopen(self, constraint_id: str) -> Constraint:
         """Remove a constraint. Who made way for it stays where it is now.
@@ -120,7 +132,7 @@ class AirspaceClosing:
             return None
         index = scheduler.index.without(np.array(movable, dtype=np.int64))
         index.close({_TO_COME: constraint.closure})
-        return _Picture(now, index, movable)
+        return _Picture(now, transaction.revision, index, movable)
 
     def _foresee(self, picture: _Picture) -> dict[int, Foreseen]:
         """Plan those who have to make way around a picture, with a planner of its own."""
@@ -129,6 +141,7 @@ class AirspaceClosing:
             self._ledger.find_all(picture.movable),
             picture.index,
             picture.now,
+            picture.revision,
             should_stop=lambda: self._elapsed_s() - began >= _AHEAD_S,
         )
 
@@ -137,12 +150,17 @@ class AirspaceClosing:
     ) -> Closed:
         scheduler = self._scheduler
         self._check_room(constraint)
+        revision = transaction.revision
         with transaction.one_revision():
             recorded = transaction.record_constraint(constraint, now)
             hit = scheduler.within(transaction, now, recorded.closure)
             vacated = scheduler.vacate(transaction, now, hit.movable)
             scheduler.index.close({recorded.number: recorded.closure})
-            numbered = {sequence: found.renumbered(_TO_COME, recorded.number) for sequence, found in foreseen.items()}
+            numbered = {
+                sequence: found.renumbered(_TO_COME, recorded.number)
+                for sequence, found in foreseen.items()
+                if found.holds_at(revision)
+            }
             cause = Cause(constraint_id=recorded.id)
             displaced = scheduler.settle(transaction, now, vacated, cause, numbered)
             ids = transaction.ids(hit.unmovable)

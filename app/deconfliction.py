@@ -213,11 +213,25 @@ class Deconfliction:
     async def activate(self, intent_id: str) -> FlightIntent:
         """Take down that an accepted flight is about to fly, or flies; raises as `cancel`."""
 
+        done: list[FlightIntent] = []
+
+        def run(transaction: Transaction, now: int) -> FlightIntent:
+            done[:] = [self._activate(transaction, now, intent_id)]
+            return done[0]
+
         def look_up() -> FlightIntent | None:
             intent = self._ledger.find(intent_id)
-            return intent if intent is not None and intent.activated_ms is not None else None
+            if intent is None or intent.activated_ms is not None:
+                return intent
+            # A change may have taken the activation away. One that has its very version came instead of it.
+            if done and intent.version > done[0].version:
+                raise OutcomeUnknown(
+                    "the commit failed, and then somebody else changed the flight intent: it is not known whether it was "
+                    "activated before; read it, and activate it again if that is still to be done"
+                )
+            return None
 
-        return await self._writer.perform(lambda transaction, now: self._activate(transaction, now, intent_id), look_up)
+        return await self._writer.perform(run, look_up)
 
     async def end(self, intent_id: str) -> FlightIntent:
         """End a flight. One that has departed and was not reported landed keeps its reservations until its arrival, or

@@ -56,6 +56,7 @@ _OWN_HEADERS: Mapping[tuple[str, str, str], tuple[tuple[str, ...], tuple[str, ..
     ("POST", "/v1/flight-intents", "201"): (("ETag", "Location", "Server-Timing"), ("Idempotent-Replayed",)),
     ("POST", "/v1/flight-intents", "409"): (("Server-Timing",), ("Idempotent-Replayed",)),
     ("POST", "/v1/flight-intents/batch", "201"): ((), ("Idempotent-Replayed",)),
+    ("POST", "/v1/constraints", "201"): (("Location",), ()),
     ("GET", _VERSIONED, "200"): (("ETag",), ()),
     ("PUT", _VERSIONED, "200"): (("ETag",), ()),
     ("DELETE", _VERSIONED, "200"): (("ETag",), ()),

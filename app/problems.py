@@ -46,7 +46,7 @@ KINDS: dict[type[Exception], Kind] = {
         "Change the entry whose index is `entry`; `reason` says what is wrong with it.",
     ),
     NoPlan: Kind(
-        "no-conflict-free-plan", 409, "The present traffic leaves no plan",
+        "no-conflict-free-plan", 409, "Traffic or closed airspace leaves no plan",
         "Submit again with a later departure; `earliest_feasible_departure` is one that works now, where known.",
     ),
     AircraftProfileError: Kind(
@@ -99,7 +99,8 @@ KINDS: dict[type[Exception], Kind] = {
         "Nothing was recorded. Send fewer flight intents at once, or the same later.",
     ),
     errors.IllegalTransition: Kind(
-        "illegal-transition", 409, "The flight intent's state does not allow this", "Read the intent's state first."
+        "illegal-transition", 409, "The flight intent's state does not allow this",
+        "Read the intent's state first; one that is displaced can be changed, which plans it again, or cancelled.",
     ),
     errors.NotChangeable: Kind(
         "not-changeable", 422, "This cannot be changed", "Leave it as it is, or cancel the intent and submit another."

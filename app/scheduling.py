@@ -6,7 +6,7 @@ sequence, around everything and displacing nobody. All of it runs in the writer'
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -20,7 +20,7 @@ from app.submitted_paths import path_refusal
 from app.times import format_time
 from planner.airmatrix import IntArray
 from planner.cfa_star import Performance, Planner, PlanRequest
-from planner.errors import NoPlan
+from planner.errors import NoPlan, SearchTooLong
 from planner.holds import holds_of
 from planner.kernels.intervals import FAR_FUTURE
 from planner.occupancy import Closure, OccupancyIndex
@@ -79,10 +79,17 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Foreseen:
-    """What planning a flight again has given before it had to make way, while it had this version."""
+    """What planning a flight again has given before it had to make way, while it had this version, and the ledger this
+    revision.
+    """
 
     version: int
+    revision: int
     outcome: Plan | NoPlan
+
+    def holds_at(self, revision: int) -> bool:
+        """Tell whether it may still be so: where there was no plan, others may have left room since."""
+        return isinstance(self.outcome, Plan) or self.revision == revision
 
     def renumbered(self, old: int, new: int) -> "Foreseen":
         """Return it with another number for a constraint that is in the way."""
@@ -122,20 +129,24 @@ class Scheduler:
             request = self.request(submission, now)
             if submission.priority <= transaction.lowest_priority:
                 return self.planner.plan(request)
-            try:
+            with suppress(NoPlan):
                 plan = self.planner.plan(request, outlook=False)
                 if not plan.delay_ms:
                     # As early as can be, and nobody has to make way.
                     return plan
-            except NoPlan:
-                pass
             until_ms = self.planner.ends_by(request)
+            index = self._unyielding(transaction, now, submission, request.earliest_departure_ms, until_ms)
             try:
-                index = self._unyielding(transaction, now, submission, request.earliest_departure_ms, until_ms)
-                return self.planner.plan(request, index, outlook=False)
-            except NoPlan:
+                return self.planner.plan(request, index, outlook=False, continues=True)
+            except SearchTooLong:
+                raise
+            except NoPlan as error:
                 # When else it could fly depends on what is reserved later.
-                return self.planner.plan(request, self._unyielding(transaction, now, submission))
+                index = self._unyielding(transaction, now, submission)
+                try:
+                    return self.planner.plan(request, index, continues=True)
+                except SearchTooLong:
+                    raise error from None
 
     def _as_submitted(
         self,
@@ -231,11 +242,16 @@ class Scheduler:
         return intents
 
     def foresee(
-        self, intents: Sequence[FlightIntent], index: OccupancyIndex, now: int, should_stop: Callable[[], bool]
+        self,
+        intents: Sequence[FlightIntent],
+        index: OccupancyIndex,
+        now: int,
+        revision: int,
+        should_stop: Callable[[], bool],
     ) -> dict[int, Foreseen]:
         """Plan flights, by sequence number, as `settle` would, with an index of the caller's and another planner.
 
-        It `should_stop` before one or another: the rest is left out. Safe in any thread.
+        The index is of `revision`. It `should_stop` before one or another: the rest is left out. Safe in any thread.
         """
         planner = self.planner.another()
         foreseen: dict[int, Foreseen] = {}
@@ -245,7 +261,7 @@ class Scheduler:
             outcome = self._again(planner, index, intent, now, outlook=False)
             if isinstance(outcome, Plan):
                 index.reserve(outcome.hold_block, outcome.hold_enter_ms, outcome.hold_exit_ms, intent.sequence)
-            foreseen[intent.sequence] = Foreseen(intent.version, outcome)
+            foreseen[intent.sequence] = Foreseen(intent.version, revision, outcome)
         return foreseen
 
     def settle(

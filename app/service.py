@@ -311,7 +311,7 @@ def _writing(
         kept_ms=policy.positions_ms,
     )
     destinations = Destinations.of(settings)
-    deliverer = Deliverer(ledger, writer, clock, Post(destinations), metrics.webhook)
+    deliverer = Deliverer(ledger, writer, clock, Post(destinations), metrics.webhook, elapsed_ms=elapsed_ms)
     writer.start()
     deliverer.start()
     metrics.index_loaded(len(planner.index))

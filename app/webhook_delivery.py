@@ -24,6 +24,7 @@ from uuid_utils import uuid4
 from app.errors import LedgerUnavailable, OutcomeUnknown, QueueFull, WebhookRefused
 from app.ledger import Ledger, Transaction
 from app.ledger.webhooks import Desk, Lease, Line, Waiting, Webhook, WebhookRows
+from app.times import monotonic_ms
 from app.webhooks import Destinations, body, delivery_id, kind_of, retry_after_ms, signature
 from app.writer import Request, Writer
 
@@ -35,8 +36,8 @@ DELIVERED, FAILED, GIVEN_UP, LOST = OUTCOMES = ("delivered", "failed", "given_up
 _EVERY_S, _AFTER_FAILURE_S, _PATIENCE_S = 0.25, 1.0, 5.0
 # Events older than this are given up when they fail once more.
 _GIVE_UP_MS = 86_400_000
-# The desk is held for so long from every record on; clocks differ, so others let that pass by their own after they have
-# seen a record. Nothing is sent that might not be answered before it ends.
+# The desk is held for so long from every record on; clocks differ and jump, so others let that pass after they have seen
+# a record, and nobody asks what time it is. Nothing is sent that might not be answered before it ends.
 _DESK_MS, _MARGIN_MS = 20_000, 7_000
 # How many journal entries are read at once. Where so many events wait, the rest stays in the journal.
 _LINES, _MOST_WAITING = 256, 10_000
@@ -139,7 +140,8 @@ async def _addresses(host: str, port: int) -> Sequence[str]:
 class Deliverer:
     """Delivers what the journal has for webhooks: between `start` and `stop` by itself, or one `look` after another.
 
-    `post` sends, `chance` spreads retries, `observe` is told the outcome of each attempt.
+    `post` sends, `chance` spreads retries, `observe` is told the outcome of each attempt. `clock` says what time it is, and
+    may be wrong; `elapsed_ms` how much has passed, and never jumps.
     """
 
     def __init__(
@@ -150,16 +152,19 @@ class Deliverer:
         post: Post,
         observe: Callable[[str], None] = lambda _: None,
         *,
+        elapsed_ms: Callable[[], int] = monotonic_ms,
         chance: Callable[[], float] = random.random,
     ) -> None:
         self._ledger = ledger
         self._writer = writer
         self._clock = clock
+        self._elapsed_ms = elapsed_ms
         self._post = post
         self._observe = observe
         self._chance = chance
         self._holder = str(uuid4())
-        # Until when the desk is surely ours, as far as recorded; the lease that was seen last, and since when.
+        # Until when the desk is surely ours, as far as recorded; the lease that was seen last, and since when: by the
+        # time that has passed, not by the clock.
         self._held_until_ms = 0
         self._lease: Lease | None = None
         self._lease_since_ms = 0
@@ -229,8 +234,8 @@ class Deliverer:
             desk, due = (rows.desk(), rows.due_webhooks(now)) if webhooks else (None, [])
         if desk is None:
             return []
-        if desk.lease != self._lease or now < self._lease_since_ms:
-            self._lease, self._lease_since_ms = desk.lease, now
+        if desk.lease != self._lease:
+            self._lease, self._lease_since_ms = desk.lease, self._elapsed_ms()
         newest = desk.revision
         # After a failover that lost commits, revisions are not what they were.
         self._read_through = {
@@ -240,7 +245,7 @@ class Deliverer:
         behind = [webhook for webhook in webhooks if self._read_through[webhook.number] < newest]
         unrecorded = [webhook for webhook in webhooks if self._read_through[webhook.number] > webhook.read_through]
         records = bool(unrecorded) and abs(now - self._recorded_ms) >= _RECORD_READ_MS
-        if not (behind or due or records) or not await self._has_desk(desk, now):
+        if not (behind or due or records) or not await self._has_desk(desk):
             return list(self._lanes)
         if records:
             reached = {webhook.number: self._read_through[webhook.number] for webhook in unrecorded}
@@ -255,31 +260,31 @@ class Deliverer:
 
     def _is_ours(self) -> bool:
         """Tell whether the desk will be ours until something that is sent now is answered."""
-        return self._held_until_ms - self._clock() > _MARGIN_MS
+        return self._held_until_ms - self._elapsed_ms() > _MARGIN_MS
 
-    async def _has_desk(self, desk: Desk, now: int) -> bool:
+    async def _has_desk(self, desk: Desk) -> bool:
         """Tell whether this process has the desk, after trying to take or to keep it where that is needed."""
-        if desk.holder != self._holder and desk.until_ms > 0 and self._over(now) is None:
+        if desk.holder != self._holder and desk.until_ms > 0 and self._over() is None:
             self._held_until_ms = 0
             return False
-        if desk.holder == self._holder and self._held_until_ms - now > _DESK_MS / 2:
+        if desk.holder == self._holder and self._held_until_ms - self._elapsed_ms() > _DESK_MS / 2:
             return True
         return await self._record(lambda *_: None)
 
-    def _over(self, now: int) -> Lease | None:
+    def _over(self) -> Lease | None:
         """Return the lease that was seen last if it has not been renewed in its time."""
-        return self._lease if now - self._lease_since_ms >= _DESK_MS else None
+        return self._lease if self._elapsed_ms() - self._lease_since_ms >= _DESK_MS else None
 
     async def _record(self, work: Work) -> bool:
         """Have something written down, if the desk is ours or free; then it is ours for a while from now on."""
-        over = self._over(self._clock())
+        over = self._over()
 
         def run(transaction: Transaction, now: int) -> int:
             with transaction.webhooks() as rows:
                 if not rows.hold_desk(self._holder, now + _DESK_MS, over):
                     return 0
                 work(rows, now)
-                return now + _DESK_MS
+                return self._elapsed_ms() + _DESK_MS
 
         try:
             request = await self._enqueue(run)
@@ -367,9 +372,9 @@ class Deliverer:
     async def _serve(self, webhook: Webhook) -> None:
         """Send what is due to a webhook, one event after another, until there is nothing more or others wait."""
         sending = self._sending[webhook.number]
-        began = self._clock()
+        began = self._elapsed_ms()
         try:
-            while self._is_ours() and not (self._is_short and self._clock() - began >= _TURN_MS):
+            while self._is_ours() and not (self._is_short and self._elapsed_ms() - began >= _TURN_MS):
                 with self._ledger.webhooks() as rows:
                     due = rows.due(webhook.number, self._clock(), len(sending) + 1)
                 waiting = next((event for event in due if event.sequence not in sending), None)

@@ -47,6 +47,9 @@ _TOO_LONG = (
     "no plan was found within the work that one request may take: the way is too busy or closed for too much of the "
     "window; ask for a shorter window, or a later one"
 )
+# So many expansions may go into a dive to the destination before the search looks at everything in the order of F: a
+# dive that misses comes back to the same blocks again and again.
+_DIVE = 20_000
 # How often a flight that would be in the air for too long is looked for again with a later departure.
 _LATER_DEPARTURES = 16
 
@@ -131,11 +134,18 @@ class Planner:
         """Return a planner with the same limits, and an index of its own."""
         return Planner(self.airspace, self.search, self.hover_limit_ms, self.detour_limit_ms, self.most_expansions)
 
-    def plan(self, request: PlanRequest, index: OccupancyIndex | None = None, *, outlook: bool = True) -> Plan:
+    def plan(
+        self,
+        request: PlanRequest,
+        index: OccupancyIndex | None = None,
+        *,
+        outlook: bool = True,
+        continues: bool = False,
+    ) -> Plan:
         """Return a conflict-free plan; with the safe-interval search the one of earliest arrival.
 
         It is free of conflicts with what `index` holds: the planner's own by default. Where there is none, an `outlook`
-        looks for a later departure that would work.
+        looks for a later departure that would work. One that `continues` has what the last one has left of the work.
 
         Raises
         ------
@@ -153,12 +163,15 @@ class Planner:
         motion = self._motion(request.performance)
         bounds = self._bounds(motion, request.origin, request.destination)
         index = self.index if index is None else index
-        self._left = UNREACHED if self.most_expansions is None else self.most_expansions
+        if not continues:
+            self._left = UNREACHED if self.most_expansions is None else self.most_expansions
         found = self._search(request, motion, bounds, index)
         if isinstance(found, Plan):
             return found
         if outlook and not request.is_airborne:
+            left = self._left
             found.earliest_feasible_departure_ms = self._earliest_feasible_departure(request, motion, bounds, index)
+            found.expansions += left - self._left
         raise found
 
     def unconstrained(self, request: PlanRequest) -> int:
@@ -278,6 +291,7 @@ class Planner:
             self.hover_limit_ms,
             min(request.latest_departure_ms + in_air - self.airspace.terminal_dwell_ms, FAR_FUTURE),
             soonest,
+            dive=_DIVE,
             most=0,
             stamp=0,
         )
@@ -288,6 +302,11 @@ class Planner:
             status, label, further = self._run(least_cost, motion, index, task, bounds, surcharge)
         else:
             status, label, further = self._run(search_kernels.safe_interval, motion, index, task, bounds)
+            if status == search_kernels.TOO_LONG and self._left > 0:
+                dived = further
+                task = task._replace(dive=0)
+                status, label, further = self._run(search_kernels.safe_interval, motion, index, task, bounds)
+                further += dived
         expansions = bounds.expansions + further
         visits = int(self._workspace.around[VISITS])
         if status == search_kernels.TOO_LONG:
@@ -295,13 +314,13 @@ class Planner:
         if status == search_kernels.NO_DEPARTURE_SLOT:
             owners = index.owners(task.origin, task.earliest, task.latest + task.climb_out + 1)
             return NoDepartureSlot(
-                "the first block is reserved throughout the departure window", owners, expansions=expansions
+                "the first block is reserved or closed throughout the departure window", owners, expansions=expansions
             )
         if status == search_kernels.NO_PATH:
             return NoConflictFreePath(
                 "no conflict-free path leads from the first block within the departure window",
                 # Who cannot land in time is not looked for on the way.
-                self._owners_around(index, label) if further else self._owners_at_the_end(index, task),
+                self._owners_around(index, label) if label else self._owners_at_the_end(index, task),
                 expansions=expansions,
             )
         plan = self._plan(motion, index, task, bounds, label, expansions, visits)
@@ -361,7 +380,8 @@ class Planner:
 
     def _owners_at_the_end(self, index: OccupancyIndex, task: Task) -> tuple[int, ...]:
         """Return the owners of what lets nobody land in time, at the last block or around it."""
-        waited = np.flatnonzero(self._workspace.marks[:, label_columns.STAMP] == self._stamp - 1)[:_SHUT_IN_LABELS]
+        waited = np.flatnonzero(self._workspace.marks[:, label_columns.STAMP] == self._stamp - 1)
+        waited = np.concatenate([[task.destination], waited[waited != task.destination]])[:_SHUT_IN_LABELS]
         return index.owners_within(waited, np.full_like(waited, task.earliest), np.full_like(waited, task.until))
 
     def _run(

@@ -198,7 +198,7 @@ class NoPlan(PlannerError):
 
 
 class NoDepartureSlot(NoPlan):
-    """The first block is reserved throughout the departure window."""
+    """The first block is reserved or closed throughout the departure window."""
 
     reason = "no_departure_slot"
 

@@ -26,7 +26,7 @@ export class NewFlight {
         layer.append(element("option", { value: k, text: `${grid.altitude(k)} m` }));
       }
       layer.addEventListener("change", () => this.#take(end, this.ends[end]));
-      byId(`pick-${end}`).addEventListener("click", () => this.pick(this.picking === end ? null : end));
+      byId(`pick-${end}`).addEventListener("click", () => this.pick(end));
     }
     byId("new-flight").addEventListener("submit", (event) => {
       event.preventDefault();

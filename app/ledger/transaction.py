@@ -376,14 +376,10 @@ class Transaction:
         """
         flight = flight_intents.c
         mine = select(flight.sequence).where(flight.operator == operator)
-        # Where something was cut off, it ends with the next millisecond.
+        # Each that arrives after now is asked, however late it departs: it may have left early, and keeps all it holds
+        # then. Where something was cut off, it ends with the next millisecond.
         holds = (reservations.c.intent == flight.sequence) & (reservations.c.exit > now_ms + 1)
-        kept = (
-            flight.departure <= now_ms,
-            flight.arrival > now_ms,
-            flight.arrival <= now_ms + self._counters.longest_flight,
-            select(reservations.c.intent).where(holds).exists(),
-        )
+        kept = flight.arrival > now_ms, select(reservations.c.intent).where(holds).exists()
         found = 0
         for some in (mine.where(positions.IS_OPEN), mine.where(positions.IS_OVER, *kept)):
             count = select(func.count()).select_from(some.limit(limit).subquery())

@@ -148,7 +148,8 @@ async def close(service: ServiceDep, body: ConstraintBody) -> Response:
         "displaced": displacements(closed.displaced),
         "unmoved": closed.unmoved,
     }
-    return Response(orjson.dumps(answer), 201, media_type="application/json")
+    headers = {"Location": f"{router.prefix}/{closed.constraint.id}"}
+    return Response(orjson.dumps(answer), 201, headers, "application/json")
 
 
 @router.get(

@@ -7,6 +7,7 @@ from typing import Annotated
 import orjson
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Response
+from fastapi.exceptions import RequestValidationError
 
 from app import problems
 from app.auth import Caller, CallerDep
@@ -36,6 +37,9 @@ from app.routes.submissions import AnyIntentBody, spoken_for, submitted
 from app.service import Service, ServiceDep
 from app.times import Timestamp, format_time
 from planner.errors import NoPlan
+
+# Entity tags, or any (RFC 9110).
+_IF_MATCH = r'^ *(\*|(W/)?"[^",]*"( *, *(W/)?"[^",]*")*) *$'
 
 router = APIRouter(prefix=PATH, tags=["flight intents"])
 
@@ -162,7 +166,14 @@ async def change(
     caller: CallerDep,
     intent_id: str,
     body: AnyIntentBody,
-    if_match: Annotated[str | None, Header(max_length=1000, description="The `ETag` of what is to be changed.")] = None,
+    if_match: Annotated[
+        str | None,
+        Header(
+            max_length=1000,
+            description="The `ETag` of what is to be changed, in its quotes; `*` for whichever.",
+            json_schema_extra={"pattern": _IF_MATCH},
+        ),
+    ] = None,
 ) -> Response:
     """Plan the flight anew with this body, under its old sequence number; where that fails, the old plan stands.
 
@@ -227,7 +238,17 @@ def _versions(if_match: str | None) -> frozenset[int] | None:
         raise PreconditionRequired("a change needs `If-Match` with the `ETag` of the flight intent as it was read")
     if if_match.strip() == "*":
         return None
-    tags = (tag.strip() for tag in if_match.split(","))
+    tags = [tag.strip() for tag in if_match.split(",")]
+    if not re.search(_IF_MATCH, if_match):
+        raise RequestValidationError(
+            [
+                {
+                    "loc": ("header", "If-Match"),
+                    "msg": f'{if_match[:50]} is no entity tag: send the ETag in its quotes, such as "1", or *',
+                    "type": "value_error",
+                }
+            ]
+        )
     # What is no version of ours, weak tags among them, matches nothing.
     return frozenset(int(tag[1:-1]) for tag in tags if re.fullmatch(r'"[0-9]{1,18}"', tag, re.ASCII))
 

@@ -32,8 +32,8 @@ class Task(NamedTuple):
     """One request: blocks, departure window, terminal dwell, the greedy search's hover limit, in ms; its stamp.
 
     `climb_out` is the dwell before the first link: none for a flight that is in the air already. Nothing that gets to
-    the destination after `until` is looked for, and nothing gets there before `soonest`. After the `most`
-    expansions a search gives up.
+    the destination after `until` is looked for, and nothing gets there before `soonest`. A search may
+    `dive`: for so many expansions, 0 for none, all F that are too early count alike. After the `most` it gives up.
     """
 
     origin: int
@@ -45,6 +45,7 @@ class Task(NamedTuple):
     hover_limit: int
     until: int
     soonest: int
+    dive: int
     most: int
     stamp: int
 

@@ -35,13 +35,15 @@ def earliest_presence(
 @kernel
 def earliest_landing(
     open_links: Int32Array, motion: Motion, slabs: Slabs, ws: Workspace, task: Task, bounds: Bounds, departure: int
-) -> int:
+) -> tuple[int, int]:
     """Return a bound of the arrival of who leaves the first block at `departure`, by what is reserved around the last.
 
     Nobody leaves a block of a way before a presence there, and has the time to go still to fly then: the arrival is no
     earlier than the largest such sum, on the way where that is least. Blocks are looked at in the order of it, from the
     destination back to where nobody has to wait: through all of a closed volume, but seldom beyond the first one.
     Uses the heap, and marks where one has to wait, and the destination, with the stamp before the task's.
+
+    Returns the bound, and how many blocks beside the destination were looked around.
     """
     shape, links, near = motion
     table, pool, _ = slabs
@@ -53,10 +55,13 @@ def earliest_landing(
     landing = earliest_presence(table, pool, task.destination, entering, task.dwell, task.earliest, soonest)
     marks[task.destination, STAMP] = stamp
     size = push(heap, 0, landing, task.destination, task.destination)
-    landing = FAR_FUTURE
-    while size > 0 and heap[0, KEY] < min(landing, task.until + 1) and size + 26 <= heap.shape[0]:
+    landing, looked = FAR_FUTURE, 0
+    while (
+        size > 0 and heap[0, KEY] < min(landing, task.until + 1) and size + 26 <= heap.shape[0] and looked < task.most
+    ):
         behind, p = heap[0, KEY], heap[0, ITEM]
         size = pop(heap, size)
+        looked += p != task.destination
         i, j, k = coordinates(shape, p)
         for link in range(26):
             n = p + links[link, OFFSET]
@@ -73,4 +78,4 @@ def earliest_landing(
             else:
                 marks[n, STAMP] = stamp
                 size = push(heap, size, max(behind, present + h), n, n)
-    return landing if size == 0 else min(landing, heap[0, KEY])
+    return landing if size == 0 else min(landing, heap[0, KEY]), looked

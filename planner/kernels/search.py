@@ -123,7 +123,8 @@ def safe_interval(
     (partial expansion): a label returns to the OpenList with the least F that its next arrivals can have. So neither
     links that lead away nor reservations far in the future cost anything.
 
-    Returns status, goal label (without a path, how many labels there are), and expansions.
+    Returns status, goal label (without a path, how many labels there are, 0 where nobody can land in time), and
+    expansions.
     """
     shape, links, near = motion
     table, pool, _ = slabs
@@ -136,13 +137,17 @@ def safe_interval(
         return NO_DEPARTURE_SLOT, -1, 0
     if count == labels.shape[0]:
         return WORKSPACE_FULL, -1, 0
-    landing = max(task.soonest, earliest_landing(open_links, motion, slabs, ws, task, bounds, labels[0, G]))
-    if landing > min(task.until, FAR_FUTURE - 1):
-        return NO_PATH, count, 0
+    landing, expansions, most = 0, 0, task.most
+    if task.dive > 0:
+        landing, expansions = earliest_landing(open_links, motion, slabs, ws, task, bounds, labels[0, G])
+        if landing > min(task.until, FAR_FUTURE - 1):
+            return NO_PATH, 0, expansions
+        landing = max(landing, task.soonest)
+        if landing > labels[0, G] + h:
+            most = min(most, task.dive)
     size = 0
     for label in range(count):
         size = open_label(heap, size, labels, label, max(labels[label, G] + h, landing), task.earliest)
-    expansions = 0
     bound = task.until
     f_least = key_f(heap[0, KEY])
     while size > 0:
@@ -152,7 +157,7 @@ def safe_interval(
             continue
         if not labels[label, CLOSED] and can_end(labels, label, task):
             return FOUND, label, expansions
-        if expansions == task.most:
+        if expansions >= most:
             return TOO_LONG, -1, expansions
         expansions += 1
         if count + 26 > labels.shape[0] or size + 27 > heap.shape[0]:

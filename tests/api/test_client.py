@@ -161,7 +161,7 @@ def test_a_ready_service_says_so(town: Client) -> None:
 
 def test_a_recorded_refusal_is_a_problem_with_its_members(town: Client, later: int) -> None:
     first = town.submit(flight((0, 7, 2), (9, 7, 2), later))
-    with pytest.raises(ProblemAnswer, match=r"^409 The present traffic leaves no plan: ") as problem:
+    with pytest.raises(ProblemAnswer, match=r"^409 Traffic or closed airspace leaves no plan: ") as problem:
         town.submit(flight((0, 7, 2), (9, 7, 2), later + 1, later + 1))
     assert (problem.value.status, problem.value.reason) == (409, "no_departure_slot")
     members = problem.value.members

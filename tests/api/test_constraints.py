@@ -79,6 +79,12 @@ def test_a_constraint_is_made_and_read(lanes: Client, clock: FakeClock) -> None:
 
 
 @on_sqlite
+def test_the_answer_says_where_the_constraint_can_be_read(lanes: Client) -> None:
+    answer = lanes.post(CONSTRAINTS, json=body())
+    assert lanes.get(answer.headers["Location"]).json()["id"] == answer.json()["id"]
+
+
+@on_sqlite
 def test_of_members_that_nobody_knows_the_first_is_told(lanes: Client) -> None:
     for known in ({}, {"from": format_time(START_MS)}):
         answer = problem(lanes.post(CONSTRAINTS, json=body(colour="red", size=3) | known), 422, "validation-error")

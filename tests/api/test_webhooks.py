@@ -63,11 +63,19 @@ def still(lanes: Client) -> Client:
     return lanes
 
 
+def delivering_by(client: Client, post: Post, *, clock: Callable[[], int] | None = None, **options: Any) -> Deliverer:
+    """Return what delivers when it is asked to, by the service's clock or one that jumps."""
+    service = client.service
+    return Deliverer(
+        service.ledger, service.writer, clock or service.clock, post, elapsed_ms=service.clock, **options
+    )
+
+
 def deliverer(client: Client, patience_s: float = 5.0) -> Deliverer:
     """Return what delivers when it is asked to, and takes the longest time between retries."""
-    service = client.service
-    post = Post(LOCAL, patience_s)
-    return Deliverer(service.ledger, service.writer, service.clock, post, service.metrics.webhook, chance=lambda: 0.0)
+    return delivering_by(
+        client, Post(LOCAL, patience_s), observe=client.service.metrics.webhook, chance=lambda: 0.0
+    )
 
 
 def deliver(*deliverers: Deliverer, ignoring: tuple[type[Exception], ...] = ()) -> None:
@@ -271,11 +279,6 @@ class SlowPost(Post):
         await self._take(host)
 
 
-def delivering_by(client: Client, post: Post) -> Deliverer:
-    service = client.service
-    return Deliverer(service.ledger, service.writer, service.clock, post)
-
-
 def test_receivers_that_hang_take_no_more_than_their_operators_lanes(still: Client) -> None:
     for operator in ("slow", "slower"):
         for number in range(8):
@@ -395,6 +398,44 @@ def test_two_processes_whose_clocks_differ_deliver_each_event_once(
         clock.advance(seconds=DESK_S)
         deliver(successor)
     assert receiver.kinds == ["accepted", "activated", "ended", "accepted"]
+
+
+def test_who_has_the_desk_keeps_it_for_as_long_as_its_lease_lasts(
+    still: Client, clock: FakeClock, receiver: Receiver
+) -> None:
+    subscribe(still, receiver.url)
+    holder, other = deliverer(still), deliverer(still)
+    flight = submit(still)
+    deliver(holder, other)
+    still.post(f"{SUBMIT}/{flight}/activate")
+    clock.advance(seconds=DESK_S - 1)
+    deliver(other)
+    assert receiver.kinds == ["accepted"]
+    clock.advance(seconds=1)
+    deliver(other)
+    assert receiver.kinds == ["accepted", "activated"]
+
+
+@pytest.mark.parametrize("jump_s", [-3_600, 3_600])
+def test_a_clock_that_jumps_neither_takes_the_desk_nor_keeps_it(
+    still: Client, clock: FakeClock, receiver: Receiver, jump_s: int
+) -> None:
+    jumped = FakeClock(0)
+
+    def jumping() -> int:
+        return clock() + jumped()
+
+    subscribe(still, receiver.url)
+    holder, other = (delivering_by(still, Post(LOCAL), clock=jumping) for _ in range(2))
+    flight = submit(still)
+    deliver(holder, other)
+    still.post(f"{SUBMIT}/{flight}/activate")
+    jumped.advance(seconds=jump_s)
+    deliver(other)
+    assert (holder._is_ours(), other._is_ours()) == (True, False)
+    clock.advance(seconds=DESK_S)
+    deliver(other)
+    assert (holder._is_ours(), other._is_ours()) == (False, True)
 
 
 def test_a_process_that_stops_leaves_the_desk_to_the_next(lanes: Client, receiver: Receiver) -> None:

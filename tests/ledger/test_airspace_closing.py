@@ -1,6 +1,7 @@
 """Closing airspace that many flights hold: they are planned ahead, while others are served, and moved in one piece."""
 
 import asyncio
+import threading
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import replace
 from typing import Any
@@ -194,4 +195,43 @@ def test_who_finds_no_place_is_told_which_constraint_is_in_the_way(street: Proce
         assert flight.state is State.DISPLACED
         assert flight.refusal is not None
         assert flight.refusal.conflicting_constraints == (closed.constraint.id,)
+    assert_sound(street)
+
+
+def test_who_could_not_fly_because_of_somebody_who_has_left_since_is_planned_again(
+    street: Process, meanwhile: Meanwhile
+) -> None:
+    for flight in everything(street).values():
+        done(street.deconfliction.cancel(flight.id))
+    hit = submitted(street, along(window_ms=UNTIL_MS + 1_000 - DEPARTURE_MS)).intent
+    in_the_way = submitted(street, along(earliest_ms=UNTIL_MS, window_ms=0)).intent
+    found = meanwhile(lambda: done(street.deconfliction.cancel(in_the_way.id)))
+    asyncio.run(street.airspace_closing.close(closing([STREET.block("W")], DEPARTURE_MS - 10_000, UNTIL_MS)))
+    assert not isinstance(found[0][hit.sequence].outcome, Plan)
+    assert everything(street)[hit.sequence].state is State.ACCEPTED
+    assert_sound(street)
+
+
+def test_a_closing_that_hits_nobody_does_not_wait_for_one_that_plans_ahead(
+    street: Process, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on, foresee = threading.Event(), Scheduler.foresee
+
+    def slowly(*arguments: Any, **named: Any) -> dict[int, Foreseen]:
+        assert goes_on.wait(10)
+        return foresee(*arguments, **named)
+
+    monkeypatch.setattr(Scheduler, "foresee", slowly)
+
+    async def both() -> tuple[Closed, Closed]:
+        middle = closing([STREET.block((3, 0, 0))], DEPARTURE_MS - 10_000, UNTIL_MS)
+        slow = asyncio.ensure_future(street.airspace_closing.close(middle))
+        long_ago = closing([STREET.block((3, 0, 0))], DEPARTURE_MS - 20_000, DEPARTURE_MS - 19_000)
+        quick = await asyncio.wait_for(street.airspace_closing.close(long_ago), 10)
+        goes_on.set()
+        return quick, await slow
+
+    quick, slow = asyncio.run(both())
+    assert (len(quick.displaced), len(slow.displaced)) == (0, FLIGHTS)
+    assert quick.constraint.number < slow.constraint.number
     assert_sound(street)

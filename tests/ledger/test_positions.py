@@ -181,6 +181,26 @@ def test_a_flight_that_ends_in_the_millisecond_in_which_it_departs_keeps_what_it
     assert one.indexed(clock.now_ms) == reserved(one.location, clock.now_ms)
 
 
+def test_a_flight_that_may_have_left_early_counts_among_the_open_ones_until_it_should_have_arrived(
+    square: Process, clock: FakeClock
+) -> None:
+    def counted() -> int:
+        with square.ledger.transaction() as transaction:
+            return transaction.count_open("acme-air", 10, clock.now_ms)
+
+    early, on_its_pad = (
+        square.submit(SQUARE.submission("N", "S", earliest_ms=DEPARTURE_MS + hours * 3_600_000)) for hours in (1, 2)
+    )
+    see(square, Aircraft(early.sequence), clock.now_ms, airborne=True)
+    assert held(square.cancel(early)) == held(early)
+    assert held(square.cancel(on_its_pad)) == set()
+    assert counted() == 1
+    clock.now_ms = arrival(early) - 1
+    assert counted() == 1
+    clock.advance(ms=1)
+    assert counted() == 0
+
+
 def kept_and_down(process: Process, clock: FakeClock) -> FlightIntent:
     """Return a flight that was ended in the air, and whose aircraft was seen on the ground since."""
     intent = process.submit(SQUARE.submission("N", "S"))

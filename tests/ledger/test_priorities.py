@@ -18,9 +18,9 @@ from structlog.testing import capture_logs
 from app.batches import BatchOutcome
 from app.commands.verify import checked
 from app.constraints import UNMOVED, Constraint
-from app.deconfliction import Outcome
+from app.deconfliction import Outcome, PreviewPlan
 from app.errors import IllegalTransition, LedgerUnavailable, OutcomeUnknown, PreconditionFailed, RequestError
-from app.flight_intents import Displacement, FlightIntent, State, Submission
+from app.flight_intents import Displacement, FlightIntent, Refusal, State, Submission
 from app.ledger import JournalEntry
 from app.replica import OccupancyReplica
 from app.scheduling import Limits
@@ -522,6 +522,27 @@ def test_when_else_an_urgent_flight_could_fly_depends_on_who_flies_long_after_it
     assert refused.earliest_feasible_departure_ms == base_ms + (count - 1) * HOLD_MS + 1_669
 
 
+def test_an_urgent_flight_takes_no_more_work_than_any_other(street: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is planned around everybody, and around those who stay: together for what one request may take."""
+    submitted(street, along(window_ms=0))
+    request, run, took = along(1, window_ms=60_000), street.planner._run, []
+
+    def counted(*arguments: Any, **named: Any) -> tuple[int, int, int]:
+        outcome = run(*arguments, **named)
+        took.append(outcome[2])
+        return outcome
+
+    monkeypatch.setattr(street.planner, "_run", counted)
+    assert isinstance(asyncio.run(street.deconfliction.preview(request)), PreviewPlan)
+    assert len(took) == 2
+    street.planner.most_expansions = sum(took)
+    assert isinstance(asyncio.run(street.deconfliction.preview(request)), PreviewPlan)
+    street.planner.most_expansions = sum(took[:2]) - 1
+    refused = asyncio.run(street.deconfliction.preview(request))
+    assert isinstance(refused, Refusal)
+    assert refused.reason == "search_too_long"
+
+
 def test_a_flight_that_was_activated_is_not_moved(street: Process) -> None:
     first = submitted(street, along(earliest_ms=DEPARTURE_MS + 60_000)).intent
     asyncio.run(street.deconfliction.activate(first.id))
@@ -550,7 +571,7 @@ def test_who_finds_no_place_any_more_holds_nothing_and_says_why(street: Process)
     assert flight.refusal is not None
     assert flight.refusal.detail == (
         f"displaced by flight intent {outcome.intent.id}, which has a higher priority, and then: "
-        "the first block is reserved throughout the departure window"
+        "the first block is reserved or closed throughout the departure window"
     )
     assert flight.refusal.conflicting_intents == (outcome.intent.id,)
     assert flight.refusal.earliest_feasible_departure_ms == DEPARTURE_MS + 1_669

@@ -17,7 +17,7 @@ from sqlalchemy.exc import OperationalError
 from app.batches import BatchKey
 from app.deconfliction import IdempotencyKey, Outcome
 from app.errors import LedgerUnavailable, OutcomeUnknown
-from app.flight_intents import State, Submission
+from app.flight_intents import FlightIntent, State, Submission
 from app.ledger import open_ledger
 from app.writer import BatchReport
 from tests.ledger.commits import commit_and_fail, fail, on_commit, on_next_commit, unwritable
@@ -202,6 +202,102 @@ def test_a_cancellation_whose_commit_failed_has_not_happened(square: Process) ->
     assert (found.state, held(found)) == (State.ACCEPTED, held(intent))
     square.submit(SQUARE.submission("S", "N"))
     assert_sound(square)
+
+
+@contextmanager
+def before_looking_up(process: Process, happens: Callable[[], object]) -> Iterator[None]:
+    """Let something happen once a commit is uncertain, before the ledger is asked what came of it."""
+    find = process.ledger.find
+
+    def find_too_late(intent_id: str) -> FlightIntent | None:
+        happens()
+        return find(intent_id)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(process.ledger, "find", find_too_late)
+        yield
+
+
+def test_a_change_is_not_taken_for_one_that_moved_the_flight_elsewhere_under_the_same_version(
+    pair: tuple[Process, Process],
+) -> None:
+    one, other = pair
+    request = STREET.submission("W", "E")
+    first = one.submit(request)
+    with (
+        before_looking_up(one, lambda: other.submit(replace(request, priority=1))),
+        on_next_commit(fail),
+        pytest.raises(OutcomeUnknown, match="somebody else changed"),
+    ):
+        asyncio.run(one.deconfliction.change(first.id, request, None))
+    moved = one.ledger.find(first.id)
+    assert moved is not None
+    # Nothing but the path tells it from what was to be written.
+    assert (moved.version, moved.state, moved.submission) == (2, State.ACCEPTED, first.submission)
+    assert departure(moved) > departure(first)
+
+
+def test_a_change_that_was_refused_at_first_and_not_even_tried_again_is_not_answered_by_that_refusal(
+    street: Process, clock: FakeClock
+) -> None:
+    street.submit(STREET.submission("W", "E"))
+    second = street.submit(STREET.submission("W", "E", earliest_ms=DEPARTURE_MS + 600_000))
+
+    def render_late(_: Outcome) -> Never:
+        clock.now_ms = DEPARTURE_MS + 1
+        raise RuntimeError("the batch is done again, after the departure that was asked for")
+
+    late = IdempotencyKey("key", "digest", render_late)
+    with on_next_commit(fail):
+        answers = street.together(
+            street.deconfliction.change(second.id, STREET.submission("W", "E", window_ms=0), None),
+            street.deconfliction.submit(STREET.submission("W", "E", earliest_ms=DEPARTURE_MS + 1_200_000), late),
+        )
+    assert [type(answer) for answer in answers] == [LedgerUnavailable] * 2
+
+
+def test_an_activation_whose_commit_was_lost_is_answered_from_the_ledger(street: Process) -> None:
+    first = street.submit(STREET.submission("W", "E"))
+    with on_next_commit(commit_and_fail):
+        activated = asyncio.run(street.deconfliction.activate(first.id))
+    assert (activated.state, activated.version) == (State.ACTIVATED, 2)
+
+
+def later(intent: FlightIntent, process: Process) -> None:
+    """Put a flight off by a day; it is not activated then."""
+    tomorrow = STREET.submission("W", "E", earliest_ms=DEPARTURE_MS + 86_400_000)
+    assert isinstance(asyncio.run(process.deconfliction.change(intent.id, tomorrow, None)), Outcome)
+
+
+def test_whether_a_flight_was_activated_before_somebody_put_it_off_is_not_known(
+    ledger: str, clock: FakeClock
+) -> None:
+    with Process(ledger, STREET.airspace, clock) as one, Process(ledger, STREET.airspace, clock) as other:
+        for process in (one, other):
+            process.deconfliction._activation_lead_ms = 3_600_000
+        first = one.submit(STREET.submission("W", "E"))
+        with (
+            before_looking_up(one, lambda: later(first, other)),
+            on_next_commit(commit_and_fail),
+            pytest.raises(OutcomeUnknown, match="not known whether it was activated"),
+        ):
+            asyncio.run(one.deconfliction.activate(first.id))
+        found = one.ledger.find(first.id)
+    assert found is not None
+    assert (found.version, found.activated_ms) == (3, None)
+
+
+def test_a_flight_that_was_put_off_under_the_version_of_its_activation_was_not_activated(
+    pair: tuple[Process, Process],
+) -> None:
+    one, other = pair
+    first = one.submit(STREET.submission("W", "E"))
+    with (
+        before_looking_up(one, lambda: later(first, other)),
+        on_next_commit(fail),
+        pytest.raises(LedgerUnavailable, match="nothing was recorded"),
+    ):
+        asyncio.run(one.deconfliction.activate(first.id))
 
 
 def cut(location: str, *, after_commit: bool) -> Callable[[Connection], None]:

@@ -199,7 +199,8 @@ def test_a_flight_to_what_a_ring_of_closed_airspace_lies_around_is_refused_at_on
     with pytest.raises(NoConflictFreePath) as refused:
         planner.plan(flight(sketch["A"], sketch["B"], earliest=0, latest=10))
     assert refused.value.conflicting_owners == (-1,)
-    assert refused.value.expansions < 12
+    # The look for a later departure comes on top.
+    assert refused.value.expansions < 20
 
 
 @pytest.mark.parametrize(("limit", "is_refused"), [(98, True), (99, False)])
