@@ -226,8 +226,8 @@ class Deconfliction:
             # A change may have taken the activation away. One that has its very version came instead of it.
             if done and intent.version > done[0].version:
                 raise OutcomeUnknown(
-                    "the commit failed, and then somebody else changed the flight intent: it is not known whether it was "
-                    "activated before; read it, and activate it again if that is still to be done"
+                    "the commit failed, and then somebody else changed the flight intent: it is not known whether it "
+                    "was activated before; read it, and activate it again if that is still to be done"
                 )
             return None
 

@@ -36,8 +36,8 @@ DELIVERED, FAILED, GIVEN_UP, LOST = OUTCOMES = ("delivered", "failed", "given_up
 _EVERY_S, _AFTER_FAILURE_S, _PATIENCE_S = 0.25, 1.0, 5.0
 # Events older than this are given up when they fail once more.
 _GIVE_UP_MS = 86_400_000
-# The desk is held for so long from every record on; clocks differ and jump, so others let that pass after they have seen
-# a record, and nobody asks what time it is. Nothing is sent that might not be answered before it ends.
+# The desk is held for so long from every record on; clocks differ and jump, so others let that pass after they have
+# seen a record, and nobody asks what time it is. Nothing is sent that might not be answered before it ends.
 _DESK_MS, _MARGIN_MS = 20_000, 7_000
 # How many journal entries are read at once. Where so many events wait, the rest stays in the journal.
 _LINES, _MOST_WAITING = 256, 10_000
@@ -140,8 +140,8 @@ async def _addresses(host: str, port: int) -> Sequence[str]:
 class Deliverer:
     """Delivers what the journal has for webhooks: between `start` and `stop` by itself, or one `look` after another.
 
-    `post` sends, `chance` spreads retries, `observe` is told the outcome of each attempt. `clock` says what time it is, and
-    may be wrong; `elapsed_ms` how much has passed, and never jumps.
+    `post` sends, `chance` spreads retries, `observe` is told the outcome of each attempt. `clock` says what time it is,
+    and may be wrong; `elapsed_ms` how much has passed, and never jumps.
     """
 
     def __init__(

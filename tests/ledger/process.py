@@ -71,6 +71,7 @@ class Process:
         limits: Limits = PERIODS,
         search: Search = Search.SAFE_INTERVAL,
         few: int = FEW,
+        activation_lead_ms: int | None = None,
     ) -> None:
         self.location = location
         self.ledger = open_ledger(location, airspace, claim=True)
@@ -86,7 +87,9 @@ class Process:
             on_death=on_death,
         )
         scheduler = Scheduler(self.planner, performances, limits)
-        self.deconfliction = Deconfliction(self.writer, self.ledger, scheduler, freshness_ms=5_000)
+        self.deconfliction = Deconfliction(
+            self.writer, self.ledger, scheduler, freshness_ms=5_000, activation_lead_ms=activation_lead_ms
+        )
         self.airspace_closing = AirspaceClosing(self.writer, self.ledger, scheduler, few=few)
         self.batches = Batches(self.writer, self.ledger, scheduler, self.deconfliction)
         self.writer.start()

@@ -10,13 +10,14 @@ from app.errors import LedgerUnavailable
 from app.flight_intents import FlightIntent, State
 from app.surveillance import Aircraft, Remark, Sighting
 from tests.ledger.commits import commit_and_fail, fail, on_next_commit
-from tests.ledger.district import SQUARE, START_MS, STREET
+from tests.ledger.district import DEPARTURE_MS, SQUARE, START_MS, STREET
 from tests.ledger.locations import database
 from tests.ledger.process import (
     DAY_MS,
     POLICY,
     FakeClock,
     Process,
+    arrival,
     assert_gapless,
     assert_no_overlaps,
     assert_sound,

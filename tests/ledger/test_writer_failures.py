@@ -269,17 +269,16 @@ def later(intent: FlightIntent, process: Process) -> None:
     assert isinstance(asyncio.run(process.deconfliction.change(intent.id, tomorrow, None)), Outcome)
 
 
-def test_whether_a_flight_was_activated_before_somebody_put_it_off_is_not_known(
-    ledger: str, clock: FakeClock
-) -> None:
-    with Process(ledger, STREET.airspace, clock) as one, Process(ledger, STREET.airspace, clock) as other:
-        for process in (one, other):
-            process.deconfliction._activation_lead_ms = 3_600_000
+def test_whether_a_flight_was_activated_before_somebody_put_it_off_is_not_known(ledger: str, clock: FakeClock) -> None:
+    with (
+        Process(ledger, STREET.airspace, clock, activation_lead_ms=3_600_000) as one,
+        Process(ledger, STREET.airspace, clock, activation_lead_ms=3_600_000) as other,
+    ):
         first = one.submit(STREET.submission("W", "E"))
         with (
             before_looking_up(one, lambda: later(first, other)),
             on_next_commit(commit_and_fail),
-            pytest.raises(OutcomeUnknown, match="not known whether it was activated"),
+            pytest.raises(OutcomeUnknown, match="whether it was activated before"),
         ):
             asyncio.run(one.deconfliction.activate(first.id))
         found = one.ledger.find(first.id)
